@@ -17,7 +17,7 @@ from mfvpr.cli.programs import Parser, run_command
 from mfvpr.datasets.datasets import folder
 from mfvpr.evaluation import Confidence, confidence_inputs, fit_confidence, rank_dataset
 from mfvpr.evaluation.confidence import reliability
-from mfvpr.localization.map_settings import data_of_drive
+from mfvpr.localization.map import fit_on_drive
 from mfvpr.storage import FeatureCache
 
 SURE = 0.8  # confidence from which on a prediction is taken for an answer
@@ -42,7 +42,7 @@ def run(drives: list[str]) -> None:
     system, cache = load_system("mfvpr"), FeatureCache()
     folders = {name: paths.split(":") for name, _, paths in (drive.partition("=") for drive in drives)}
     datasets = {name: folder(*paths, ground_truth="order") for name, paths in folders.items()}
-    data = {name: data_of_drive(dataset, system, cache)[0] for name, dataset in datasets.items()}
+    data = {name: fit_on_drive(dataset, system, cache)[1] for name, dataset in datasets.items()}
     present = {name: (values.present, values.correct) for name, values in data.items()}
     absent = {}
     for place, other in itertools.permutations(folders, 2):

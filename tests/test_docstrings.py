@@ -28,9 +28,6 @@ import numpy as np
 import mfvpr
 from mfvpr import *
 from mfvpr.checkpoints import load_model
-from mfvpr.datasets.contents import contents, own_rows
-from mfvpr.datasets.published import published_dataset
-from mfvpr.datasets.streets import draw_streets
 from mfvpr.features import Aggregated, Sift, VladFitting
 from mfvpr.retrieval import Retrieval
 from mfvpr.storage import FeatureCache

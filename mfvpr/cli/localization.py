@@ -17,8 +17,8 @@ from mfvpr.cli.schema import Localize, MapBuild
 from mfvpr.datasets import image_folder, read_image
 from mfvpr.datasets.image_reading import VIDEO_SUFFIXES, read_frames
 from mfvpr.evaluation import Confidence, System
-from mfvpr.localization import Drive, Localization, Located, Map, Route
-from mfvpr.localization.map_settings import fit_to_map, read_settings, read_system
+from mfvpr.localization import Drive, Located, Map, Route
+from mfvpr.localization.map_images import fit_to_map, read_settings, read_system
 from mfvpr.report.runs import file_names
 from mfvpr.storage.maps import Entry
 from mfvpr.systems import assembly
@@ -35,8 +35,8 @@ def build_map(settings: MapBuild) -> None:
     system = assembly.system(settings)
     images = dataset_of(settings.dataset).database
     folder = expand_user(settings.map)
-    robot_map = Map(folder, fit_to_map(folder, system, images, warn))
-    added = robot_map.build(images, track=track("images"))
+    robot_map = Map(folder, fit_to_map(folder, system, images, warn), runtime=Runtime(progress=track))
+    added = robot_map.build(images)
     print(f"{robot_map.folder}: {len(robot_map)} images, {added} of them new")
 
 
@@ -74,29 +74,18 @@ def localize(settings: Localize) -> None:
     system = read_system(folder)
     confidence = _confidence(settings, system)
     robot_map = Map(folder, system, confidence=confidence, threshold=settings.threshold, runtime=runtime)
-    drive, failed = _Drive(robot_map, settings), 0
+    drive = _Drive(robot_map, settings)
     for number, (name, image) in enumerate(images_of(settings)):
         if number == 0 and len(robot_map):
             tell(f"{len(robot_map):,} images in the map; the first image takes longer")
-        line: dict[str, Any] = {"image": name}
+        line: dict[str, Any] = {}
         try:
-            pixels = image if isinstance(image, np.ndarray) else read_image(image)
-            localized = drive.localize(name, pixels, line)
-        except InputError as error:
-            if not len(robot_map):
-                raise
-            failed, localized = failed + 1, None
-            line |= {"error": str(error)} | drive.entry_without_image()
-        try:
-            if localized is not None:
-                drive.add(name, localized, line)
-                drive.draw(number, name, pixels, localized, line)
-        finally:  # the prediction must not be lost if its image cannot be added
-            print(printable(json.dumps(line, ensure_ascii=False, allow_nan=False)), flush=True)
-    if failed:
-        raise InputError(f"{failed} of the images could not be localized; their lines say why")
-    if drive.undrawn:
-        raise InputError(f"{drive.undrawn} of the figures could not be drawn; warnings say why")
+            drive.localize(number, name, image, line)
+        finally:  # the prediction must not be lost if its image cannot be added or drawn
+            if line:
+                print(printable(json.dumps({"image": name} | line, ensure_ascii=False, allow_nan=False)), flush=True)
+    if drive.failed:
+        raise InputError(f"{drive.failed} of the images could not be localized; their lines say why")
     if drive.missing:
         names = ",".join(sorted(map(str, drive.missing)))
         raise InputError(f"figures=[{names}]: expected rows of localized images, from 0, or names as in the lines")
@@ -106,63 +95,49 @@ class _Drive:
     """One drive through a map: images are localized, added and drawn one by one."""
 
     def __init__(self, robot_map: Map, settings: Localize) -> None:
-        self._map, self._settings = robot_map, settings
+        self._map, self._settings, figures = robot_map, settings, settings.figures
         advance = None if isinstance(settings.route, str) else settings.route
         tell_route = lambda text: warn(f"route={advance}: {text} (route=auto)")  # noqa: E731
         self._route = None if settings.route is None else Route(Drive(advance), warn=tell_route)
-        figures = settings.figures
         self._wanted = set(range(figures) if isinstance(figures, int) else figures)
         self.missing = set() if isinstance(figures, int) else {*self._wanted}  # figures whose image did not come
-        self.undrawn = 0
+        self.failed = 0
         self._root = None if settings.root is None else expand_user(settings.root)
         if self._root and not self._root.is_dir():
             raise InputError(f"root={self._root}: expected the folder of the map's images, got no folder")
 
-    def localize(self, name: str, pixels: Pixels, line: dict[str, Any]) -> Localization:
-        """Localize an image and fill its line; one that is in the map sees the images before it."""
-        start, settings = time.perf_counter(), self._settings
-        row = self._map.row(name) if settings.add else None
-        localized = self._map.localize_with_evidence(pixels, recent=settings.recent, before=row, route=self._route)
-        prediction = localized.prediction
-        line |= prediction.as_json(settings.alternatives) | self._route_entry(prediction.located)
+    def localize(self, number: int, name: str, image: Path | Pixels, line: dict[str, Any]) -> None:
+        """Localize an image, `number` from 0, add it to the map and draw it as the settings say, and fill its line."""
+        start, settings, known = time.perf_counter(), self._settings, self._map
+        row = known.row(name) if settings.add else None  # an image that is in the map sees the images before it
+        try:
+            pixels = image if isinstance(image, np.ndarray) else read_image(image)
+            localized = known.localize_with_evidence(pixels, recent=settings.recent, before=row, route=self._route)
+        except InputError as error:
+            if not len(known):
+                raise
+            self.failed += 1
+            rows = known.there[: max(0, len(known) - settings.recent)]  # the robot has moved
+            line.update({"error": str(error)} | self._route_entry(self._route and self._route(None, rows)))
+            return
+        prediction, (features, vector), _ = localized
+        line.update(prediction.as_json(settings.alternatives) | self._route_entry(prediction.located))
         if settings.field_of_view is not None:
             line["shift_angles"] = prediction.shift_angles(settings.field_of_view)
         line["seconds"] = round(time.perf_counter() - start, 4)
-        return localized
+        if settings.add:
+            if row is None:
+                known.add_described([Entry(name, name, vector)], [features])
+            line["added"] = row is None
+        names = {number, name, PurePath(name).name}
+        if settings.out is not None and self._wanted & names:
+            from mfvpr.report.figures import localization_figure  # here: Matplotlib takes 0.4 s
 
-    def add(self, name: str, localized: Localization, line: dict[str, Any]) -> None:
-        """Add an image to the end of the map if the settings say so, unless the map has one of this name."""
-        if not self._settings.add:
-            return
-        features, vector = localized.described
-        is_new = self._map.row(name) is None
-        if is_new:
-            self._map.add_described([Entry(name, name, vector)], [features])
-        line["added"] = is_new
-
-    def draw(self, number: int, name: str, pixels: Pixels, localized: Localization, line: dict[str, Any]) -> None:
-        """Draw the figure of an image, `number` from 0, if the settings name it; warn if that fails."""
-        settings, names = self._settings, {number, name, PurePath(name).name}
-        if settings.out is None or not self._wanted & names:
-            return
-        self.missing -= names
-        [file] = file_names([f"{number:04d}_{PurePath(name).stem}"]).values()
-        path = expand_user(settings.out) / f"{file}.png"
-        from mfvpr.report.figures import localization_figure  # here: Matplotlib takes 0.4 s
-
-        try:
-            localization_figure(path, self._map, name, pixels, localized, root=self._root)
+            self.missing -= names
+            [file] = file_names([f"{number:04d}_{PurePath(name).stem}"]).values()
+            path = expand_user(settings.out) / f"{file}.png"
+            localization_figure(path, known, name, pixels, localized, root=self._root)
             line["figure"] = str(path)
-        except Exception as error:  # of any kind from Matplotlib; the line must still be printed
-            line["figure"] = None
-            self.undrawn += 1
-            warn(f"{path}: not drawn ({error})")
-
-    def entry_without_image(self) -> dict[str, Any]:
-        """The route's entry in the line of an image that cannot be read: the robot has moved."""
-        rows = self._map.there
-        rows = rows[: max(0, len(rows) - self._settings.recent)]
-        return self._route_entry(self._route and self._route(None, rows))
 
     def _route_entry(self, located: Located | None) -> dict[str, Any]:
         if self._route is None or located is None:

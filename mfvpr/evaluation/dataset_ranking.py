@@ -207,7 +207,7 @@ def match_sequence(
         with watch("features"):
             sides, remarks = _extract(dataset, sequence, pipeline, retrieved, cache)
         for store in stores[:1]:  # for later runs, which read the matches and nothing else
-            cache.log(f"{sequence.name} matches: {len(sequence.images)} queries, in {store.folder}")
+            cache.runtime.log(f"{sequence.name} matches: {len(sequence.images)} queries, in {store.folder}")
             write_text(store.folder / _REMARKS, json.dumps(remarks))
         with watch("matching"):
             matches = tuple(
@@ -259,13 +259,13 @@ def _read_matches(
     sequence: QuerySequence, stores: Sequence[MatchStore], cache: FeatureCache, watch: Stopwatch
 ) -> tuple[tuple[MatchSet, ...], Shortlist, dict[str, Any]] | None:
     """Matches of all scales from the stores, their shortlist, and remarks on images; None if some are missing."""
-    if not all(store.has_all(range(len(sequence.images))) for store in stores):
+    if not all(store.is_complete for store in stores):
         return None
     try:
         remarks = json.loads((stores[0].folder / _REMARKS).read_text())
     except (OSError, ValueError):
         return None  # so images are read again, but not matched
-    cache.log(f"{sequence.name} matches: all {len(sequence.images)} queries from {stores[0].folder}")
+    cache.runtime.log(f"{sequence.name} matches: all {len(sequence.images)} queries from {stores[0].folder}")
     with watch("matches read"):
         scales = [scale for store in stores if (scale := stages.stored_matches(store, memory=cache.runtime.memory))]
     if len(scales) < len(stores):

@@ -18,7 +18,7 @@ from jaxtyping import Float, UInt8
 
 from mfvpr.core.batch import score_candidates
 from mfvpr.core.histogram import HistogramOfShifts
-from mfvpr.core.types import Features, Matches
+from mfvpr.core.types import Matches
 from mfvpr.core.weights import RatioWeight
 from mfvpr.datasets.datasets import ImageFolder, QuerySequence, image_folder
 from mfvpr.datasets.image_reading import gray, resize, write_image
@@ -27,6 +27,7 @@ from mfvpr.evaluation.dataset_ranking import RankedDataset, Reason, match_sequen
 from mfvpr.evaluation.rankings import Matched
 from mfvpr.evaluation.system import Pipeline, noise_images
 from mfvpr.features.extractor import Source
+from mfvpr.features.feature_set import strength
 from mfvpr.retrieval.retriever import Retrieval
 from mfvpr.storage.feature_cache import FeatureCache
 
@@ -61,11 +62,6 @@ def reason_against_image(pixels: UInt8[np.ndarray, "height width 3"]) -> Reason 
     if (correlations < _LEAST_CORRELATION).all():
         return "no better than noise"
     return "blurred" if (correlations > _MOST_CORRELATION).all() else None
-
-
-def strength(features: Features) -> float:
-    """Sum of the detection scores of one image's unpadded features; negative scores count as 0."""
-    return float(np.maximum(features.scores, 0).sum())
 
 
 def evidence_scores(pairs: Matches) -> Float[np.ndarray, " pairs"]:

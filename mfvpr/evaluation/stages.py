@@ -36,7 +36,7 @@ from mfvpr.matchers import host_matcher as host
 from mfvpr.matchers.host_matcher import PairSource, Side
 from mfvpr.matchers.match_set import MatchSet, QueryMatches, Scales, batches, partition, queries_that_fit, scales
 from mfvpr.matchers.matcher import NEIGHBORS, Matcher
-from mfvpr.storage.cache_files import MatchStore, StoredMatches
+from mfvpr.storage.cache_files import MatchStore
 from mfvpr.utils.errors import InputError
 from mfvpr.utils.numerics import Device, at_least_single, available_cpus, compiled, device_of, knows_own_context
 from mfvpr.utils.runtime import DEFAULT_RUNTIME, Runtime, ordered_map
@@ -182,7 +182,7 @@ def match(
         return MatchSet.of([query.matches for query in matched], counts)
     missing = [
         row
-        for row, query in store.read(range(len(queries)))
+        for row, query in enumerate(store.read())
         if query is None or not np.array_equal(query.indices, candidates.indices[row])
     ]
     if missing:
@@ -216,9 +216,9 @@ def stored_matches(store: MatchStore, *, memory: float | None = None) -> tuple[M
 
     Matches of more than `memory` GB (None: a third of what is free) stay on disk.
     """
-    rows, matches, shortlist = range(store.num_queries), list[Matches](), list[Any]()
+    matches, shortlist = list[Matches](), list[Any]()
     left = memory_budget(memory, jax.local_devices(backend="cpu")[:1])
-    for _, query in store.read(rows):
+    for query in store.read():
         if query is None:
             return None
         left -= sum(leaf.nbytes for leaf in jax.tree.leaves(query.matches))
@@ -227,7 +227,7 @@ def stored_matches(store: MatchStore, *, memory: float | None = None) -> tuple[M
             matches.clear()
         shortlist.append((query.counts, query.indices, query.filter_scores))
     counts, indices, scores = (np.stack(values) for values in zip(*shortlist, strict=True))
-    return MatchSet.of(matches or StoredMatches(store, rows), counts), Shortlist(indices, scores, indices >= 0)
+    return MatchSet.of(matches or store, counts), Shortlist(indices, scores, indices >= 0)
 
 
 @dataclass(frozen=True)

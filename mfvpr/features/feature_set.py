@@ -228,6 +228,11 @@ def without_padding(image: Features) -> Features:
     return Features(**arrays | {"mask": mask[mask]}, image_size=np.asarray(image.image_size, np.float32))
 
 
+def strength(image: Features) -> float:
+    """Sum of the detection scores of one image's features; negative scores count as 0."""
+    return float(np.maximum(np.asarray(image.scores)[np.asarray(image.mask)], 0).sum())
+
+
 def check_features(image: Features, name: str, *, unit_length: bool) -> None:
     """Check Features of one image that come from user code; errors begin with `name`."""
     shapes = np.shape(image.mask), np.shape(image.image_size)

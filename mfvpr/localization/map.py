@@ -1,6 +1,8 @@
 """`Map`: localize one image in a folder of images whose places are known."""
 
+import json
 import math
+import warnings
 from collections import defaultdict
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
@@ -16,36 +18,38 @@ from mfvpr.core.batch import BIN_STEP, score_candidates
 from mfvpr.core.histogram import HistogramOfShifts
 from mfvpr.core.scorer import Scorer, fit_capacities, require_scores
 from mfvpr.core.types import Features, Matches, Shortlist
-from mfvpr.datasets.datasets import GroundTruth, ImageFolder, image_folder
+from mfvpr.datasets.datasets import Dataset, GroundTruth, ImageFolder, image_folder
 from mfvpr.datasets.datasets import folder as folder_dataset
-from mfvpr.evaluation.confidence import REFUSALS, Confidence
-from mfvpr.evaluation.dataset_ranking import Reason
+from mfvpr.datasets.ground_truth import middle
+from mfvpr.evaluation.confidence import (
+    REFUSALS,
+    CalibrationData,
+    Confidence,
+    absent_ranking,
+    calibration_data,
+    confidence_from_json,
+)
+from mfvpr.evaluation.dataset_ranking import Reason, rank_dataset
 from mfvpr.evaluation.evidence import (
     LEAST_STRENGTH,
+    evidence_against,
     evidence_scores,
     reason_against,
     reason_against_image,
-    strength,
 )
 from mfvpr.evaluation.rankings import Ranked, rank_by_scores
 from mfvpr.evaluation.stages import pair_shifts, require_finite
 from mfvpr.evaluation.system import System, noise_images
-from mfvpr.features.extractor import Extractor, Source
-from mfvpr.features.feature_set import STEP, stack_features
-from mfvpr.features.vlad import VladFitting
-from mfvpr.localization.map_images import Described, Image, MapImages, exclusive, is_file, load
-from mfvpr.localization.map_settings import fit_on_drive, fit_to_map, read_confidence, read_system, write_confidence
-from mfvpr.localization.predictions import Alternative, Localization, Prediction, refusal
+from mfvpr.features.feature_set import STEP, stack_features, strength
+from mfvpr.localization.map_images import Described, Image, MapImages, exclusive, fit_to_map, load, read_system
+from mfvpr.localization.predictions import Alternative, Localization, Prediction
 from mfvpr.localization.route import Route
-from mfvpr.matchers.host_matcher import PairSource
 from mfvpr.matchers.matcher import Matcher, match_pairs
-from mfvpr.retrieval.retriever import Retrieval
-from mfvpr.retrieval.search import ExactSearch
 from mfvpr.storage.feature_cache import FeatureCache
 from mfvpr.utils.compiled_programs import keep_compiled_programs
 from mfvpr.utils.errors import InputError
 from mfvpr.utils.fields import whole
-from mfvpr.utils.fingerprints import recipe_of
+from mfvpr.utils.fingerprints import fingerprint, recipe_of
 from mfvpr.utils.numerics import available_cpus, knows_own_context, round_up
 from mfvpr.utils.runtime import DEFAULT_RUNTIME, Runtime, ordered_map
 
@@ -53,6 +57,8 @@ Point = tuple[float, float]
 
 _PAIRS_AT_ONCE = 8  # a scorer takes the time of so many, also for a single image of a rare size
 _LEAST_SLOTS = 256  # of an image
+_USUAL = 10  # images with the shares of `REFUSALS`, that are added to those of a drive
+_LEAST_RANGE = 0.02  # of the confidence over a drive that tells correct from incorrect predictions
 _ROWS = whole(0, 10**9)  # an argument that is a number of rows
 
 
@@ -83,28 +89,29 @@ class Map(MapImages):
         Args:
             folder: of the map.
             system: extracts local features of one scale, and retrieves candidates by global descriptors: of an
-                extractor, or aggregated from the local features by a vocabulary, which is learned once (`learn`, or
-                `build`) and stored in the folder. The ranking that decides may combine scores.
-            confidence: gives the probability that the top prediction is correct, as an evaluation with the same system
-                wrote it; None = that of `calibrate`, or no probability.
+                extractor, or aggregated by a vocabulary, which is learned once (`learn`, or `build`) and stored.
+            confidence: gives the probability that the top prediction is correct; None = that of `calibrate`, or none.
             threshold: of the confidence, below which there is no place.
-            runtime: memory that features may take on the device.
+            runtime: memory that features may take, progress, and messages.
 
         Raises:
             InputError: a system that a map cannot use, a threshold without a confidence, a folder with a map that was
                 made with another system, or a new map of a system whose image size follows the images (`create`).
         """
-        system = fit_to_map(Path(folder), system, None, runtime.log)
-        extractor, describer = _parts_of(system)
-        super().__init__(folder, system, extractor, describer, memory=runtime.memory)
-        self.confidence = confidence or read_confidence(self._file, system)
-        if threshold is not None and not 0 <= threshold <= 1:
-            raise InputError(f"threshold={threshold}: expected a number from 0 to 1, or None")
-        if threshold is not None and self.confidence is None:
-            raise InputError(f"threshold={threshold}: expected a confidence as well, which gives probabilities")
-        self.threshold = threshold
+        super().__init__(Path(folder), fit_to_map(Path(folder), system, None, runtime.log), runtime)
+        if confidence is None and (part := self._file.part("confidence")):
+            content = json.loads(part)
+            if content["system"] != _fingerprint(self.system):
+                expected = "the confidence of this map's system, got that of another system or version"
+                raise InputError(f"{folder}: expected {expected}; calibrate again")
+            confidence = confidence_from_json(content["confidence"])
+        if threshold is not None and (confidence is None or not 0 <= threshold <= 1):
+            expected = "a number from 0 to 1, and a confidence as well, which gives probabilities; calibrate the map"
+            raise InputError(f"threshold={threshold}: expected {expected}")
+        self.confidence, self.threshold = confidence, threshold
         self._noise_scores: dict[int, float] = {}  # by the number of rows
-        self._typical = extractor.scales[0].typical_count
+        self._typical = self.extractor.scales[0].typical_count
+        self._matcher: Any = self.system.pipeline.matcher  # one that JAX compiles, see `describers_of`
         keep_compiled_programs()
 
     @classmethod
@@ -133,7 +140,7 @@ class Map(MapImages):
         if same := len({*known.names} & {*images.names}):
             fix = "make another map if their content is new"
             runtime.log(f"{folder}: has {same} of {len(images)} images already, by their names, and keeps them; {fix}")
-        known.build(images, places, cache=cache, track=runtime.progress("images"))
+        known.build(images, places, cache=cache)
         return known
 
     def calibrate(
@@ -157,7 +164,11 @@ class Map(MapImages):
         """
         dataset = folder_dataset(database, queries, ground_truth=ground_truth)
         self.confidence, data = fit_on_drive(dataset, self.system, cache)
-        write_confidence(self._file, self._parts(), self.system, self.confidence, data)
+        if (of_system := _fingerprint(self.system)) is None:
+            warnings.warn("a part of the system names no `recipe`: the confidence is not kept on disk", stacklevel=2)
+        else:
+            content = {"system": of_system, "queries": len(data.correct), "absent_queries": data.num_absent}
+            self._write({"confidence": json.dumps(content | {"confidence": vars(self.confidence)}).encode()})
         return self.confidence
 
     def localize(self, image: Image, *, recent: int = 0, route: Route | None = None) -> Prediction:
@@ -189,9 +200,9 @@ class Map(MapImages):
         (_ROWS | None).check("before", before)
         self._refresh_images()
         pixels, total = load(image), len(self)
-        description, resized = self.describing.pixels(pixels, str(image) if is_file(image) else "image")
+        described, resized = self.describing.pixels(pixels)
         end = max(0, (total if before is None else min(int(before), total)) - int(recent))
-        localized = self._localize(description, end, pixels.shape[1::-1], reason_against_image(resized))
+        localized = self._localize(described, end, pixels.shape[1::-1], reason_against_image(resized))
         if route is None:
             return localized
         refusals = REFUSALS if self.confidence is None else self.confidence.refusals
@@ -209,69 +220,57 @@ class Map(MapImages):
         """
         self._refresh_images()
         self.describing.image(noise_images()[0])
-        matcher: Any = self.system.pipeline.matcher  # see `_parts_of`
-        counts = self._counts().tolist()
-        rows = {padded_size(count, self._typical): row for row, count in enumerate(counts)}  # one of each size
+        rows = {padded_size(count, self._typical): row for row, count in enumerate(self._counts)}  # one of each size
         images = self._read_features([*rows.values()])
         for row, features in zip(rows.values(), images, strict=True):  # its own best candidate: nothing is left out
-            match_and_score(features, images, matcher, self.system.scorers, self._typical)
-            description = features, self._vectors[row]
-            self._localize(description, len(self), self.extractor.image_size, None)
+            match_and_score(features, images, self._matcher, self.system.scorers, self._typical)
+            self._localize((features, self._vectors[row]), len(self), self.extractor.image_size, None)
 
     def _refresh_images(self) -> None:
         self.refresh()
         if not len(self):
             raise InputError(f"{self.folder}: expected a map with images, got an empty one; add some")
 
-    def _localize(self, description: Described, end: int, size: tuple[int, int], reason: Reason | None) -> Localization:
+    def _localize(self, described: Described, end: int, size: tuple[int, int], reason: Reason | None) -> Localization:
         """Localize a described image of (width, height) px among the rows before `end`, if no reason is against it."""
-        if strength(description[0]) < LEAST_STRENGTH * self._mean_strength(end):
+        features, vector = described
+        if end and strength(features) < LEAST_STRENGTH * self._strengths[end] / end:
             reason = "too few features"
+        rows, similarities = self._vectors.nearest(vector, self.candidates, before=end)
+        if reason is None and not len(rows):
+            reason = "no candidates"
         if reason is not None:
-            return refusal(reason, description, size[0])
-        matched = self._match(description, end, self.system.scorers)
-        if matched is None:
-            return refusal("no candidates", description, size[0])
-        rows, similarities, matches, scores = matched
+            return Localization(Prediction(reason=reason, image_width=size[0]), described, None)
+        candidates = self._read_features(rows.tolist())
+        matches, scores = match_and_score(features, candidates, self._matcher, self.system.scorers, self._typical)
         ranking = self._rank(rows, similarities, scores)
         best = matches[int(np.flatnonzero(rows == ranking.rows[0, 0])[0])]
-        [score], noise = evidence_scores(best), self._noise_score(end)
-        if reason := reason_against(best.mask.sum(), score, noise):
-            return refusal(reason, description, size[0])
+        if reason := reason_against(best.mask.sum(), evidence_scores(best)[0], self._noise_score(end)):
+            return Localization(Prediction(reason=reason, image_width=size[0]), described, None)
         p = math.nan if self.confidence is None else float(self.confidence(ranking)[0])
-        p = None if math.isnan(p) else p  # without a finite score
         alternatives = tuple(
             Alternative(row, self._names[row], self._places[row], score)
             for row, score in zip(ranking.rows[0].tolist(), ranking.scores[0].tolist(), strict=True)
         )
-        shift = shift_of(self.system.scorers.values(), best, size)
-        prediction = Prediction(
-            alternatives[0].place, alternatives, alternatives[0].score, p, *shift, image_width=size[0]
-        )
-        if self.threshold is not None and not (p is not None and p >= self.threshold):
+        top, shift = alternatives[0], shift_of(self.system.scorers.values(), best, size)
+        confidence = None if math.isnan(p) else p  # without a finite score
+        prediction = Prediction(top.place, alternatives, top.score, confidence, *shift, image_width=size[0])
+        if self.threshold is not None and not p >= self.threshold:
             prediction = prediction.without_place("low confidence")
-        return Localization(prediction, description, jax.tree.map(lambda leaf: leaf[0], best))
-
-    def _match(
-        self, description: Described, end: int, scorers: Mapping[str, Scorer]
-    ) -> tuple[np.ndarray, np.ndarray, list[Matches], dict[str, np.ndarray]] | None:
-        """Candidates before `end`, their similarities, matches and scores; None without candidates."""
-        features, vector = description
-        rows, similarities = self._vectors.nearest(vector, self.candidates, before=end)
-        if not len(rows):
-            return None
-        matcher: Any = self.system.pipeline.matcher  # see `_parts_of`
-        candidates = self._read_features(rows.tolist())
-        return rows, similarities, *match_and_score(features, candidates, matcher, scorers, self._typical)
+        return Localization(prediction, described, jax.tree.map(lambda leaf: leaf[0], best))
 
     def _noise_score(self, end: int) -> float:
         """The best score of noise images; while a map grows, it changes when the number of rows has doubled."""
         end = 1 << max(0, end.bit_length() - 1)
         if end not in self._noise_scores:
-            descriptions = map(self.describing.image, noise_images(self.extractor.image_size))
-            parts = [self._match(description, end, {}) for description in descriptions]
-            scores = [evidence_scores(pair)[0] for _, _, matches, _ in filter(None, parts) for pair in matches]
-            self._noise_scores[end] = float(np.max(scores, initial=0))
+            scores = [0.0]
+            for image in noise_images(self.extractor.image_size):
+                features, vector = self.describing.image(image)
+                rows, _ = self._vectors.nearest(vector, self.candidates, before=end)
+                candidates = self._read_features(rows.tolist())
+                pairs, _ = match_and_score(features, candidates, self._matcher, {}, self._typical)
+                scores += [float(evidence_scores(pair)[0]) for pair in pairs]
+            self._noise_scores[end] = float(np.max(scores))
         return self._noise_scores[end]
 
     def _rank(self, rows: np.ndarray, similarities: np.ndarray, scores: Mapping[str, np.ndarray]) -> Ranked:
@@ -279,9 +278,9 @@ class Map(MapImages):
         pad = lambda values, fill: np.pad(values, (0, self.candidates - len(values)), constant_values=fill)[None]  # noqa: E731
         shortlist = Shortlist(pad(rows, -1), pad(similarities, 0), pad(np.ones(len(rows), bool), False))
         padded_scores = {name: pad(values, np.nan) for name, values in scores.items()}
-        headline = self.system.headline
-        rankings = rank_by_scores(shortlist, padded_scores, [self.system.final_scores[headline]], self.system.ties)
-        return Ranked(rankings[headline].rows[:, : len(rows)], rankings[headline].scores[:, : len(rows)])
+        final = self.system.final_scores[self.system.headline]
+        [ranking] = rank_by_scores(shortlist, padded_scores, [final], self.system.ties).values()
+        return Ranked(ranking.rows[:, : len(rows)], ranking.scores[:, : len(rows)])
 
 
 def match_and_score(
@@ -290,9 +289,8 @@ def match_and_score(
     """Matches `[1, K, ...]` of an unpadded query with each candidate, and scores by name.
 
     Images are padded to one of a few sizes by their own numbers of keypoints, so that no pair's result and time depend
-    on the other pairs. A pair's product keeps all cores busy, but the steps after it keep one busy. So each core takes
-    a few pairs at a time. `typical` is a usual number of keypoints, or the detector's limit. If no score is finite, an
-    InputError is raised.
+    on the other pairs. Each core takes a few pairs at a time, since the steps after a pair's product keep one core
+    busy. `typical` is a usual number of keypoints, or the detector's limit. An InputError if no score is finite.
     """
     padded_query = stack_features([query], padded_size(len(query.mask), typical), total=1)
     by_size = defaultdict[int, list[int]](list)
@@ -351,29 +349,44 @@ def shift_of(
     return point, (low, high) if low and high else None
 
 
-def _parts_of(system: System) -> tuple[Extractor, Extractor | VladFitting]:
-    """The extractors of features and of global descriptors; an InputError for a system that a map cannot use."""
-    extractor, candidates = system.pipeline.extractor, system.pipeline.candidates
-    if isinstance(extractor, Source):
-        name = type(extractor).__name__
-        raise InputError(f"{name}: a map extracts features of images itself; expected an extractor")
-    if (number := len(extractor.scales)) != 1:
-        raise InputError(f"{type(extractor).__name__}: a map takes local features of one scale, got {number}")
-    if isinstance(matcher := system.pipeline.matcher, PairSource):
-        raise InputError(f"{type(matcher).__name__}: a map compiles its matcher; expected one that JAX can compile")
-    if candidates == "all":
-        raise InputError("candidates='all': expected a number, which a map matches whatever it holds")
-    if system.correlated or system.sequences:
-        expected = "a system without frame correlation and sequences; mfvpr.Route follows a drive"
-        raise InputError(f"a map ranks single images: expected {expected}")
-    retriever = system.pipeline.retriever
-    if not isinstance(retriever, Retrieval) or not isinstance(retriever.search, ExactSearch):
-        name = type(retriever).__name__
-        raise InputError(f"{name}: a map retrieves by global descriptors without whitening; expected Retrieval(...)")
-    if isinstance(describer := retriever.describer, Extractor):
-        return extractor, describer
-    is_same = recipe_of(describer.extractor) == recipe_of(extractor)
-    if not is_same or not isinstance(describer.fitting, VladFitting):
-        expected = "Aggregated(extractor, VladFitting(...)) of the same extractor"
-        raise InputError(f"a map aggregates its local features: expected {expected}")
-    return extractor, describer.fitting
+def fit_on_drive(dataset: Dataset, system: System, cache: FeatureCache | None) -> tuple[Confidence, CalibrationData]:
+    """Fit the confidence of the ranking that decides on a data set; also what it was fitted on.
+
+    Each query counts twice: as it is, and without the images of its place, see `calibration_data`.
+    """
+    truth, root, cache = dataset.only.truth, dataset.queries.root, cache or FeatureCache()
+    if truth is None:
+        raise InputError(f"{dataset.name}: expected a ground truth, which says what is correct, got none")
+    result, threshold = rank_dataset(dataset, system, cache=cache), middle(truth.thresholds())
+    [ranked] = result.systems[system.headline]
+    absent = absent_ranking(ranked, truth, threshold)
+    refused = []  # of the queries as they are, and without the images of their place
+    for rankings in (ranked, absent):
+        [reasons] = evidence_against(replace(result, systems={system.headline: [rankings]}), cache)
+        refused.append(np.array([reason is not None for reason in reasons]))
+    shown, has_absent = truth.positives(threshold).counts > 0, absent.rows[:, 0] >= 0
+    on, off = refused[0][shown], np.concatenate([refused[0][~shown], refused[1][has_absent]])
+    usual_on, usual_off = _USUAL * np.array(REFUSALS)
+    refusals = (on.sum() + usual_on) / (len(on) + _USUAL), (off.sum() + usual_off) / (len(off) + _USUAL)
+    data = calibration_data(ranked, truth, threshold)
+    confidence = replace(data.fit(), refusals=(float(refusals[0]), float(refusals[1])))
+    probabilities, reasons = confidence.probability(data.present), list[str]()
+    if not data.num_absent:
+        reason = "without the images of a query's place there are no candidates, so that places that the map does not"
+        reasons.append(f"{reason} show get too high a confidence")
+    if np.ptp(probabilities[np.isfinite(probabilities)]) < _LEAST_RANGE:
+        reason = f"scores do not tell correct predictions ({data.correct.sum()} of {len(data.correct)}) from incorrect"
+        reasons.append(f"{reason} ones, so that every image gets the same confidence")
+    for reason in reasons:
+        warnings.warn(f"{root}: {reason}; calibrate on a longer drive", stacklevel=3)
+    return confidence, data
+
+
+def _fingerprint(system: System) -> str | None:
+    """A hash of everything that scores depend on; None if a part has no recipe."""
+    pipeline = system.pipeline
+    parts = (pipeline.extractor, pipeline.retriever, pipeline.matcher, pipeline.candidates, dict(system.scorers))
+    try:
+        return fingerprint(recipe_of([*parts, dict(system.fused), system.ties, system.headline]))
+    except TypeError:
+        return None

@@ -1,17 +1,16 @@
-"""The images of a map: how they are described and added, their global descriptors in memory, features on demand."""
+"""What a map holds: its settings, and images: how they are described and added, and read on demand."""
 
-import itertools
 import json
 import os
 import shutil
 import threading
-from collections import OrderedDict, deque
+from collections import OrderedDict
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from functools import partial, wraps
 from pathlib import Path
-from typing import Any, TypeGuard, TypeVar
+from typing import Any, TypeVar
 
 import jax
 import numpy as np
@@ -21,30 +20,93 @@ from numpy.typing import ArrayLike
 from mfvpr.core.types import Features
 from mfvpr.datasets.datasets import ImageFolder
 from mfvpr.datasets.image_reading import read_image, resize
-from mfvpr.evaluation.evidence import strength
-from mfvpr.evaluation.system import System
+from mfvpr.evaluation.system import Note, System
 from mfvpr.features.extractor import Aggregation, Description, Extractor, describe_images
 from mfvpr.features.feature_set import SHARE, check_features
 from mfvpr.features.vlad import Vlad, VladFitting
-from mfvpr.localization.map_settings import check_settings, kept_settings
+from mfvpr.matchers.host_matcher import PairSource
+from mfvpr.retrieval.search import ExactSearch
+from mfvpr.storage.cache_files import pack_arrays, round_as_stored, unpack_arrays
 from mfvpr.storage.feature_cache import FeatureCache
 from mfvpr.storage.maps import Entry, MapFile, check_entry
-from mfvpr.storage.packing import pack_arrays, round_as_stored, unpack_arrays
+from mfvpr.systems import assembly
+from mfvpr.systems.assembly import SystemSettings
 from mfvpr.utils.errors import InputError
+from mfvpr.utils.fields import from_values
 from mfvpr.utils.files import canonical_name
 from mfvpr.utils.fingerprints import recipe_of
 from mfvpr.utils.numerics import as_array, available_cpus, free_host_bytes
-from mfvpr.utils.runtime import Runtime, Track, no_progress, ordered_map
+from mfvpr.utils.runtime import Runtime, ordered_map
 
-_LEARNING = ".learning"  # the folder of features that a vocabulary is being learned from
-_AT_ONCE = 16  # images that are described without a cache
-_SAMPLE = 32  # images whose strength is measured; a sample has up to twice as many
+_KEPT = ("features", "retrieval", "matching", "scorer", "candidates", "fusion", "final", "ties")  # settings
+_ABOUT = 1.5  # relative difference of numbers of pixels: sides are rounded
 _FIRST_ROWS = 1024  # of global descriptors; twice as many whenever they are full
 
 Image = Path | str | ArrayLike
 Described = tuple[Features, np.ndarray]
 Pixels = UInt8[np.ndarray, "_ _ 3"]
 Method = TypeVar("Method", bound=Callable[..., Any])
+
+
+def describers_of(system: System) -> tuple[Extractor, Extractor | VladFitting]:
+    """The extractors of features and of global descriptors; an InputError for a system that a map cannot use."""
+    pipeline, retriever = system.pipeline, system.pipeline.retriever
+    extractor: Any = pipeline.extractor
+    describer: Any = getattr(retriever, "describer", None)
+    is_own = isinstance(describer, Extractor)
+    if isinstance(getattr(describer, "fitting", None), VladFitting):
+        is_own = describer.extractor is extractor or recipe_of(describer.extractor) == recipe_of(extractor)
+    needs = {
+        "an extractor of local features of one scale": isinstance(extractor, Extractor) and len(extractor.scales) == 1,
+        "a matcher that JAX can compile": not isinstance(pipeline.matcher, PairSource),
+        "a number of candidates": pipeline.candidates != "all",
+        "single images; mfvpr.Route follows a drive": not (system.correlated or system.sequences),
+        "retrieval by global descriptors without whitening": isinstance(
+            getattr(retriever, "search", None), ExactSearch
+        ),
+        "descriptors of an extractor, or Aggregated(extractor, VladFitting()) of its own": is_own,
+    }
+    for need, is_met in needs.items():
+        if not is_met:
+            raise InputError(f"a map needs {need}")
+    return extractor, getattr(describer, "fitting", describer)
+
+
+def read_settings(folder: Path) -> dict[str, Any]:
+    """The settings of the map in a folder; an InputError without one, or for a system that no settings describe."""
+    if content := MapFile(folder).part("system"):
+        return json.loads(content)
+    fix = "Make one with `mfvpr map build` or `Map.create`"
+    open_map = "open a map of a system of your own with `Map(folder, system)`"
+    raise InputError(f"{folder}: expected a folder with a map, got none. {fix}, or {open_map}.")
+
+
+def read_system(folder: Path) -> System:
+    """The system that a map was made with; raises as `read_settings`, or if weights are missing."""
+    settings = read_settings(folder)
+    try:
+        return assembly.system(from_values(SystemSettings, settings))
+    except InputError as error:
+        raise InputError(f"{folder}: {error}") from None
+
+
+def fit_to_map(folder: Path, system: System, images: ImageFolder | None, note: Note) -> System:
+    """The system at the image size of the map in a folder; in a new one, at that of the images, see `System`.
+
+    Raises `InputError` if a new map has no images to take the shape from, or as `read_settings`.
+    """
+    if system.pipeline.pixels is None:
+        return system
+    if system.settings is not None and MapFile(folder).part("system") is not None:
+        width, height = read_settings(folder)["features"]["image_size"]
+        if not 1 / _ABOUT < width * height / system.pipeline.pixels < _ABOUT:
+            got = f"{system.pipeline.pixels} pixels. Use features.image_size=[{width},{height}]"
+            raise InputError(f"{folder}: this map was made with images of {width} x {height} px, got {got}.")
+        return system.with_image_size((width, height))
+    if images is None:
+        fix = "Use `Map.create`, or a system with features.image_size=[WIDTH,HEIGHT]"
+        raise InputError(f"image_size: expected the images of a new map, whose shape decides, got none. {fix}.")
+    return system.fit_image_size([images], note)
 
 
 def exclusive(method: Method) -> Method:
@@ -58,6 +120,21 @@ def exclusive(method: Method) -> Method:
     return run  # pyright: ignore[reportReturnType]  # of the same arguments
 
 
+def load(image: Image) -> Pixels:
+    """Read an image file, or convert an array; an InputError if it is no image."""
+    if isinstance(image, str | os.PathLike):
+        return read_image(image)
+    pixels: Any = np.zeros(0)
+    try:
+        pixels = np.asarray(as_array(image))
+        got = f"{list(pixels.shape)} {pixels.dtype}"
+    except Exception as error:  # other libraries raise any error, torch for tensors with gradients
+        got = f"{type(image).__name__} ({' '.join(str(error).split())})"
+    if pixels.ndim != 3 or pixels.shape[2] != 3 or not pixels.size or pixels.dtype != np.uint8:
+        raise InputError(f"image: expected a file or [H, W, 3] uint8 RGB, got {got}. Convert it to a NumPy array.")
+    return pixels
+
+
 @dataclass(frozen=True)
 class Describing:
     """Extractors of a map; the features of queries are rounded as a store rounds the features of the map."""
@@ -67,20 +144,28 @@ class Describing:
 
     def image(self, image: Image) -> Described:
         """Describe one image: a file, or `[H, W, 3]` uint8 RGB in any form that `np.asarray` converts."""
-        return self.pixels(load(image), str(image) if is_file(image) else "image")[0]
+        return self.pixels(load(image))[0]
 
-    def pixels(self, pixels: Pixels, name: str) -> tuple[Described, Pixels]:
-        """Describe one image; also return it at the size of the extractor. `name` stands in errors."""
-        image, description = _extract(self.extractor, pixels, name)
+    def pixels(self, pixels: Pixels) -> tuple[Described, Pixels]:
+        """Describe one image; also return it at the size of the extractor."""
+        resized, description = self._extract(self.extractor, pixels)
         features = round_as_stored(description.features)
         if not isinstance(self.describer, Extractor):
             [vector] = self.describer([features])
-            return (features, vector), image
+            return (features, vector), resized
         if self.describer is not self.extractor:
-            _, description = _extract(self.describer, pixels, name)
+            _, description = self._extract(self.describer, pixels)
         if description.vector is None:
             raise InputError("describer: gives no global descriptor; expected one that does, or VladFitting()")
-        return (features, np.asarray(description.vector, np.float32).reshape(-1)), image
+        return (features, np.asarray(description.vector, np.float32).reshape(-1)), resized
+
+    def _extract(self, extractor: Extractor, pixels: Pixels) -> tuple[Pixels, Description]:
+        """An image at the size of an extractor, and its description."""
+        resized = resize(pixels, extractor.image_size, extractor.interpolation)
+        [description] = describe_images(resized[None], extractor)
+        if description is None:
+            raise InputError("image: features are not finite (NaN or infinite)")
+        return resized, description
 
     def folder(self, images: ImageFolder, cache: FeatureCache) -> Iterator[dict[int, Described]]:
         """Describe the images of a folder that a cache lacks: batches by row. The cache may skip bad images."""
@@ -101,42 +186,11 @@ class Describing:
             yield dict(zip(batch, zip(batch.values(), values, strict=True), strict=True))
 
 
-def is_file(image: Image) -> TypeGuard[Path | str]:
-    """Whether an image is a path."""
-    return isinstance(image, str | os.PathLike)
-
-
-def load(image: Image) -> Pixels:
-    """Read an image file, or convert an array; an InputError if it is no image."""
-    if is_file(image):
-        return read_image(image)
-    expected = "image: expected a file or [H, W, 3] uint8 RGB, got"
-    try:
-        pixels = np.asarray(as_array(image))
-    except Exception as error:  # other libraries raise any error, torch for tensors with gradients
-        got = f"{type(image).__name__} ({' '.join(str(error).split())})"
-        raise InputError(f"{expected} {got}. Convert it to a NumPy array.") from None
-    if pixels.ndim != 3 or pixels.shape[2] != 3 or not pixels.size or pixels.dtype != np.uint8:
-        got = f"{list(pixels.shape)} {pixels.dtype}" if pixels.shape else type(image).__name__
-        raise InputError(f"{expected} {got}. Check that the camera gave an image.")
-    return pixels
-
-
-def _extract(extractor: Extractor, pixels: Pixels, name: str) -> tuple[Pixels, Description]:
-    """An image at the size of an extractor, and its description."""
-    image = resize(pixels, extractor.image_size, extractor.interpolation)
-    [description] = describe_images(image[None], extractor)
-    if description is None:
-        raise InputError(f"{name}: features are not finite (NaN or infinite)")
-    return image, description
-
-
 class Vectors:
-    """Global descriptors by row."""
+    """Global descriptors by row; NaN of an image without features, which is never a candidate."""
 
     def __init__(self) -> None:
-        self._values, self._is_candidate = np.zeros((0, 0), np.float32), np.zeros(0, bool)
-        self._total = 0  # rows that are used
+        self._values, self._total = np.zeros((0, 0), np.float32), 0  # rows that are used
 
     @property
     def length(self) -> int | None:
@@ -152,24 +206,18 @@ class Vectors:
         if self._total == len(self._values):
             more = np.zeros((max(_FIRST_ROWS, self._total), len(vector)), np.float32)
             self._values = np.concatenate([self._values.reshape(-1, len(vector)), more])
-            self._is_candidate = np.concatenate([self._is_candidate, np.zeros(len(more), bool)])
-        self._values[self._total] = vector
-        # An image without features has a zero descriptor and is never a candidate, as in `mfvpr.retrieval.Retrieval`.
-        self._is_candidate[self._total] = bool(np.isfinite(vector).all() and vector.any())
+        self._values[self._total] = vector if vector.any() else np.nan
         self._total += 1
 
     def nearest(
-        self, query: Float[np.ndarray, " dimensions"], number: int, *, before: int | None = None
+        self, query: Float[np.ndarray, " dimensions"], number: int, *, before: int
     ) -> tuple[Int[np.ndarray, " candidates"], Float[np.ndarray, " candidates"]]:
         """At most `number` rows `before` a row, and their products with the query, most similar first, then by row."""
-        total = self._total if before is None else max(0, min(self._total, before))
-        rows = np.flatnonzero(self._is_candidate[:total])
-        if not len(rows) or not query.any():
-            return rows[:0], np.zeros(0, np.float32)
         # Own threads: those of BLAS spin while they wait, which costs a third of the time.
         workers = available_cpus()
-        parts = np.array_split(self._values[:total], workers)
+        parts = np.array_split(self._values[:before], workers)
         products = np.concatenate([*ordered_map(partial(np.vecdot, query), parts, workers=workers)])
+        rows = np.flatnonzero(np.isfinite(products) & query.any())
         if len(rows) > number:
             least = np.partition(products[rows], -number)[-number]
             rows = rows[products[rows] >= least]
@@ -180,33 +228,28 @@ class Vectors:
 class MapImages:
     """The images of a map, which other processes may add as well: the base of `mfvpr.localization.Map`."""
 
-    def __init__(
-        self,
-        folder: Path | str,
-        system: System,
-        extractor: Extractor,
-        describer: Extractor | VladFitting,
-        *,
-        memory: float | None,
-    ) -> None:
-        """Open a map; see `mfvpr.localization.Map`. `memory` of features is in GB, None = a third of what is free."""
-        self.folder = Path(folder).absolute()  # the working directory may change
-        self.system, self.extractor, self.candidates = system, extractor, int(system.pipeline.candidates)
-        self._file, self._lock = MapFile(self.folder), threading.RLock()
-        check_settings(self._file, system)
+    def __init__(self, folder: Path, system: System, runtime: Runtime) -> None:
+        """Open a map; see `mfvpr.localization.Map`."""
+        self.folder = folder.absolute()  # the working directory may change
+        self.extractor, describer = describers_of(system)
+        self.system, self.candidates = system, int(system.pipeline.candidates)
+        self._runtime, self._file, self._lock = runtime, MapFile(self.folder), threading.RLock()
         try:
-            self._recipe = {"extractor": recipe_of(extractor), "describer": recipe_of(describer)}
+            parts = {"recipe": {"extractor": recipe_of(self.extractor), "describer": recipe_of(describer)}}
         except TypeError as error:
-            raise InputError(
-                f"{error}, by which a map knows what made its features; see mfvpr.utils.recipe_of"
-            ) from None
-        self._is_checked = False  # whether the file is known to have this recipe
+            fix = "by which a map knows what made its features; see mfvpr.utils.recipe_of"
+            raise InputError(f"{error}, {fix}") from None
+        if system.settings is not None:
+            parts = {"system": {name: system.settings[name] for name in _KEPT}} | parts
+        self._parts: dict[str, Any] = json.loads(json.dumps(parts))  # tuples become lists
+        self._is_checked = False  # whether the file is known to have these parts
         self._fitting = describer if isinstance(describer, VladFitting) else None
-        self._describing = None if isinstance(describer, VladFitting) else Describing(extractor, describer)
+        self._describing = None if isinstance(describer, VladFitting) else Describing(self.extractor, describer)
         self._names, self._places, self._row_of_name = list[str](), list[Any](), dict[str, int]()
-        self._vectors, self._strengths = Vectors(), dict[int, float]()
+        self._counts, self._strengths = list[int](), [0.0]  # of keypoints, and sums of strengths of the first rows
+        self._vectors = Vectors()
         self._features = OrderedDict[int, Features]()  # of the recently used rows
-        self._free_bytes = SHARE * free_host_bytes() if memory is None else 1e9 * memory
+        self._free_bytes = SHARE * free_host_bytes() if runtime.memory is None else 1e9 * runtime.memory
         self.refresh()
 
     def __len__(self) -> int:
@@ -243,41 +286,37 @@ class MapImages:
     def refresh(self) -> int:
         """Read the images that other processes added since; return their number.
 
-        Raises:
-            InputError: the map was made with other settings, is damaged, or was replaced since it was opened.
+        An InputError if the map was made with other settings, or is damaged.
         """
         before = len(self)
-        if not self._is_checked and (content := self._file.part("recipe")) is not None:
-            stored, recipe = json.loads(content), json.loads(json.dumps(self._recipe))
-            if differing := " and ".join(name for name in recipe if stored.get(name) != recipe[name]):
-                fix = "Use the settings that it was made with, or name another folder"
-                raise InputError(f"{self.folder}: this map was made with another {differing}. {fix}.")
-            self._is_checked = True
+        for part, now in () if self._is_checked else self._parts.items():
+            stored = json.loads(self._file.part(part) or b"{}")
+            if differing := " and ".join(name for name in stored if stored[name] != now.get(name)):
+                fix = "Use what it was made with (`mfvpr map info`), or name another folder"
+                raise InputError(f"{self.folder}: this map was made with other {differing}. {fix}.")
+            self._is_checked = bool(stored)  # the last part is in every map
         if self._describing is None and (content := self._file.part("vocabulary")) is not None:
             arrays = unpack_arrays(content)
             self._describing = Describing(self.extractor, Vlad(arrays["centers"], float(arrays["power"])))
-        for row, entry in self._file.entries(before):
+        for entry, count, strength in self._file.entries(before):
             self._vectors.append(entry.vector)
+            self._row_of_name[entry.name] = len(self)
             self._names.append(entry.name)
             self._places.append(entry.place)
-            self._row_of_name[entry.name] = row
+            self._counts.append(count)
+            self._strengths.append(self._strengths[-1] + strength)
         return len(self) - before
 
     @exclusive
-    def learn(self, images: ImageFolder, *, cache: FeatureCache | None = None, track: Track = no_progress) -> None:
+    def learn(self, images: ImageFolder, *, cache: FeatureCache | None = None) -> None:
         """Learn the vocabulary from some images, unless the map has one; arguments and errors are those of `build`."""
         if self._describing is None:
-            with self._file.lock(), self._learning(images, cache, track):
+            with self._learned(images, cache):
                 pass
 
     @exclusive
     def build(
-        self,
-        images: ImageFolder,
-        places: Sequence[Any] | None = None,
-        *,
-        cache: FeatureCache | None = None,
-        track: Track = no_progress,
+        self, images: ImageFolder, places: Sequence[Any] | None = None, *, cache: FeatureCache | None = None
     ) -> int:
         """Add the images whose names the map does not have yet; return how many were added.
 
@@ -285,8 +324,7 @@ class MapImages:
             images: to add. If the map needs a vocabulary and has none, it is learned from them first.
             places: of each image, JSON values; None = the names.
             cache: keeps the features, so that images that it knows are not described again. Without one, the folder
-                takes twice the space while a vocabulary is learned.
-            track: progress, without a cache, which has its own.
+                takes twice the space until all images are added.
 
         Raises:
             InputError: an image cannot be read, another process adds, or the disk is full: what was added stays.
@@ -294,24 +332,17 @@ class MapImages:
         places = images.names if places is None else places
         if len(places) != len(images):
             raise InputError(f"expected a place of each of {len(images)} images, got {len(places)}")
-        for name, place in zip(images.names, places, strict=True):
+        place_of = dict(zip(images.names, places, strict=True))
+        for name, place in place_of.items():
             check_entry(name, place)
         self.refresh()
         if {*images.names} <= {*self._row_of_name}:  # also in a map that can only be read
             return 0
-        with self._file.lock(), self._learning(images, cache, track) as cache:
-            place_of, before = dict(zip(images.names, places, strict=True)), len(self)
-            missing = [name for name in images.names if name not in self._row_of_name]
-            ticks = iter(track(missing, len(missing)) if cache is None else missing)  # a cache shows its own progress
-            step = _AT_ONCE if cache is None else max(1, len(missing))
-            for start in range(0, len(missing), step):
-                part = tuple(missing[start : start + step])
-                folder = replace(images, names=part)
-                for batch in self.describing.folder(folder, FeatureCache() if cache is None else cache):
-                    rows = ((part[row], vector) for row, (_, vector) in batch.items())
-                    entries = [Entry(name, place_of[name], vector) for name, vector in rows]
-                    self._add(entries, [features for features, _ in batch.values()])
-                    deque(itertools.islice(ticks, len(batch)), maxlen=0)
+        with self._learned(images, cache) as cache:
+            before, names = len(self), tuple(name for name in images.names if name not in self._row_of_name)
+            for batch in self.describing.folder(replace(images, names=names), cache):
+                entries = [Entry(names[row], place_of[names[row]], vector) for row, (_, vector) in batch.items()]
+                self._add(entries, [features for features, _ in batch.values()])
             return len(self) - before
 
     @exclusive
@@ -326,10 +357,10 @@ class MapImages:
         Raises:
             InputError: as `build`; a name that the map has; or a map without its vocabulary.
         """
-        name = canonical_name(image) if name is None and is_file(image) else name
+        if name is None and isinstance(image, str | os.PathLike):
+            name = canonical_name(Path(image))
         if name is None:
             raise InputError("name: expected one for an image that is no file")
-        check_entry(name, place)
         features, vector = self.describing.image(image)
         self.add_described([Entry(name, place, vector)], [features])
 
@@ -347,74 +378,50 @@ class MapImages:
 
     def _add(self, entries: Sequence[Entry], features: Sequence[Features]) -> None:
         """Check and add images within the lock."""
-        new_names, dimension, length = set[str](), self.extractor.scales[0].dimension, self._vectors.length
+        new_names, dimension = set[str](), self.extractor.scales[0].dimension
+        length = self._vectors.length or np.size(entries[0].vector)
         for (name, _, vector), local in zip(entries, features, strict=True):
             values = np.asarray(vector)
-            length = values.size if length is None else length
-            if values.shape != (length,) or values.dtype.kind not in "fiu":
-                raise InputError(f"{name}: expected a descriptor [{length}], got {list(values.shape)} {values.dtype}")
-            if not np.isfinite(values).all():
-                raise InputError(f"{name}: expected a descriptor of finite numbers, got NaN or infinity")
+            if values.shape != (length,) or values.dtype.kind not in "fiu" or not np.isfinite(values).all():
+                got = f"{list(values.shape)} {values.dtype}"
+                raise InputError(f"{name}: expected a descriptor [{length}] of finite numbers, got {got}")
             check_features(local, f"{name}: features", unit_length=False)
             if (got := np.shape(local.descriptors)[-1]) != dimension:
                 raise InputError(f"{name}: expected features of {dimension} dimensions, got {got}")
             if name in self._row_of_name or name in new_names:
                 raise InputError(f"{name}: the map has an image of this name; choose another")
             new_names.add(name)
-        self._file.write(self._parts(), [*zip(features, entries, strict=True)])
-        self.refresh()
+        self._write({}, [*zip(features, entries, strict=True)])
 
-    def _parts(self) -> dict[str, bytes]:
-        """Recipe and settings, the first content of a new file; nothing if they are there."""
-        check_settings(self._file, self.system)  # another process may have written it first
-        parts = {"recipe": self._recipe}
-        if self.system.settings is not None:
-            parts["system"] = kept_settings(self.system.settings)
-        return {} if self._is_checked else {name: json.dumps(part).encode() for name, part in parts.items()}
+    def _write(self, parts: dict[str, bytes], images: Sequence[tuple[Features, Entry]] = ()) -> None:
+        """Write parts and images, and settings first if the map is new."""
+        new = {} if self._is_checked else {name: json.dumps(part).encode() for name, part in self._parts.items()}
+        self._file.write(new | parts, images)
+        self.refresh()
 
     @contextmanager
-    def _learning(self, images: ImageFolder, cache: FeatureCache | None, track: Track) -> Iterator[FeatureCache | None]:
-        """Learn the vocabulary if it is missing, within the lock; yield the cache with its features, if any."""
-        self.refresh()
-        if self._describing is not None or self._fitting is None:
-            yield cache
-            return
-        temporary = self.folder / _LEARNING
-        shutil.rmtree(temporary, ignore_errors=True)  # left by a process that was killed
-        try:
-            cache = cache or FeatureCache(temporary, runtime=Runtime(progress=lambda label: track))
-            vocabulary = self._fitting.fit(cache.local(images, self.extractor)[0])
-            arrays = {"centers": vocabulary.centers, "power": np.array(vocabulary.power)}
-            self._file.write(self._parts() | {"vocabulary": pack_arrays(arrays)})
+    def _learned(self, images: ImageFolder, cache: FeatureCache | None) -> Iterator[FeatureCache]:
+        """Hold the lock, learn the vocabulary if it is missing, and yield a cache with its features."""
+        temporary = self.folder / ".features"  # stays if the process is interrupted: the next one goes on with it
+        with self._file.lock():
             self.refresh()
+            cache = cache or FeatureCache(temporary, runtime=self._runtime)
+            if self._describing is None and self._fitting is not None:
+                vocabulary = self._fitting.fit(cache.local(images, self.extractor)[0])
+                arrays = {"centers": vocabulary.centers, "power": np.array(vocabulary.power)}
+                self._write({"vocabulary": pack_arrays(arrays)})
             yield cache
-        finally:
             shutil.rmtree(temporary, ignore_errors=True)
 
     def _read_features(self, rows: Sequence[int]) -> list[Features]:
         """Features `[n, ...]` of distinct rows, in their order, NumPy; the least recently used ones make room."""
+        bytes_of = lambda features: sum(leaf.nbytes for leaf in jax.tree.leaves(features))  # noqa: E731
         for row, features in self._file.features([row for row in rows if row not in self._features]):
             self._features[row] = features
-            self._free_bytes -= _bytes(features)
+            self._free_bytes -= bytes_of(features)
         for row in rows:
             self._features.move_to_end(row)
         read = [self._features[row] for row in rows]
         while self._free_bytes < 0:
-            self._free_bytes += _bytes(self._features.popitem(last=False)[1])
+            self._free_bytes += bytes_of(self._features.popitem(last=False)[1])
         return read
-
-    def _mean_strength(self, end: int) -> float:
-        """Mean strength of rows that are spread evenly over those before `end`, which depends on `end` alone."""
-        step = 1 << max(0, (end // _SAMPLE).bit_length() - 1)
-        sample = range(0, end, step)
-        unread = [row for row in sample if row not in self._strengths]
-        self._strengths |= {row: strength(features) for row, features in self._file.features(unread)}
-        return float(np.mean([self._strengths[row] for row in sample])) if end else 0.0
-
-    def _counts(self) -> np.ndarray:
-        """`[M]` numbers of keypoints."""
-        return self._file.counts()[: len(self)]
-
-
-def _bytes(features: Features) -> int:
-    return sum(leaf.nbytes for leaf in jax.tree.leaves(features))

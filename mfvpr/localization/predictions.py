@@ -11,18 +11,12 @@ from mfvpr.utils.errors import InputError
 
 
 class Located(NamedTuple):
-    """The position of a robot on a route.
+    """The position of a robot on a route."""
 
-    row: of the map, the most probable one; None = the robot is off the map.
-    p: probability that the robot is there or at most 2 rows away.
-    advance: mean motion from one image to the next, rows.
-    off: probability that the robot is not on the map.
-    """
-
-    row: int | None
-    p: float
-    advance: float
-    off: float
+    row: int | None  # of the map, the most probable one; None = the robot is off the map
+    p: float  # probability that the robot is there or at most 2 rows away
+    advance: float  # mean motion from one image to the next, rows
+    off: float  # probability that the robot is not on the map
 
 
 @dataclass(frozen=True)
@@ -54,12 +48,12 @@ class Prediction:
         located: position on the route, if there is one.
     """
 
-    place: Any
-    alternatives: tuple[Alternative, ...] = field(repr=False)
-    score: float
-    confidence: float | None
-    shift: tuple[float, float] | None
-    shift_interval: tuple[tuple[float, float], tuple[float, float]] | None
+    place: Any = None
+    alternatives: tuple[Alternative, ...] = field(default=(), repr=False)
+    score: float = 0.0
+    confidence: float | None = None
+    shift: tuple[float, float] | None = None
+    shift_interval: tuple[tuple[float, float], tuple[float, float]] | None = None
     reason: Reason | None = None
     image_width: int = 0
     located: Located | None = None
@@ -97,18 +91,8 @@ class Prediction:
 
 
 class Localization(NamedTuple):
-    """A prediction with the features and matches that led to it.
-
-    prediction: to the query.
-    described: features and global descriptor of the query, with which it can be added to the map.
-    matches: with the best candidate, `[K, ...]`, NumPy; None if there is none.
-    """
+    """A prediction with the features and matches that led to it."""
 
     prediction: Prediction
-    described: Described
-    matches: Matches | None
-
-
-def refusal(reason: Reason, described: Described, image_width: int) -> Localization:
-    """A prediction without place and candidates."""
-    return Localization(Prediction(None, (), 0.0, None, None, None, reason, image_width), described, None)
+    described: Described  # features and global descriptor of the query, with which it can be added to the map
+    matches: Matches | None  # with the best candidate, `[K, ...]`, NumPy; None if there is none

@@ -185,11 +185,11 @@ def _whitening(
         pack=lambda whitening: {"mean": whitening.mean, "components": whitening.components},
         unpack=lambda arrays: Whitening(arrays["mean"], arrays["components"], own_origin),
     )
-    if (whitening := files.get(key)) is None:
-        if is_damaged := key in files:
+    whitening = files.get(key)
+    if whitening is None:
+        if key in files:
             cache.warn(f"{files.path(key)}: is damaged; learned again")
-        files.update({key: learn()}, once=not is_damaged)  # the first of several counts: bits may differ
-        whitening = files.get(key)
-        cache.log(f"{name} in {files.folder}")
-    assert whitening is not None
+        whitening = learn()
+        files.update({key: whitening})
+        cache.runtime.log(f"{name} in {files.folder}")
     return whitening

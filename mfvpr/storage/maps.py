@@ -1,16 +1,14 @@
-"""A map on disk: one SQLite file with a write-ahead log, which many processes read while one writes.
+"""A map on disk: one SQLite file, which many processes read while one writes.
 
 A row is in the file whole or not at all, also after a kill or on a full disk, and rows keep their order. Everything
-has a checksum: the settings and other parts, features, and name, place and global descriptor together.
+has a checksum: the settings and other parts, features, and the other values of a row together.
 """
 
 import json
-import os
 import sqlite3
-import time
 import weakref
 import zlib
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -19,19 +17,25 @@ import numpy as np
 from jaxtyping import Float
 
 from mfvpr.core.types import Features
-from mfvpr.storage.cache_files import disk_errors_as_input_errors, full_disk_error
-from mfvpr.storage.packing import pack_arrays, pack_features, unpack_arrays, unpack_features
+from mfvpr.features.feature_set import strength
+from mfvpr.storage.cache_files import (
+    disk_errors_as_input_errors,
+    pack_arrays,
+    pack_features,
+    unpack_arrays,
+    unpack_features,
+)
 from mfvpr.utils.errors import InputError
 from mfvpr.utils.files import clip_middle, lock_folder
 
 FILE = "map.sqlite"  # in the folder of the map
-_FORMAT = 3
+_FORMAT = 4
 _WAIT = 60  # seconds for another process that writes
 _SCHEMA = (
     "CREATE TABLE parts (name TEXT PRIMARY KEY, value BLOB NOT NULL, checksum INTEGER NOT NULL)",
-    "CREATE TABLE entries (row INTEGER PRIMARY KEY, name TEXT NOT NULL UNIQUE, place TEXT NOT NULL, time REAL NOT NULL,"
-    " vector BLOB NOT NULL, checksum INTEGER NOT NULL)",
-    "CREATE TABLE features (row INTEGER PRIMARY KEY, count INTEGER NOT NULL, content BLOB NOT NULL)",
+    "CREATE TABLE entries (row INTEGER PRIMARY KEY, name TEXT NOT NULL UNIQUE, place TEXT NOT NULL,"
+    " keypoints INTEGER NOT NULL, strength REAL NOT NULL, vector BLOB NOT NULL, checksum INTEGER NOT NULL)",
+    "CREATE TABLE features (row INTEGER PRIMARY KEY, content BLOB NOT NULL)",
 )
 
 
@@ -53,7 +57,6 @@ class MapFile:
         """Open nothing yet; an InputError for a folder of something else."""
         self.folder, self._path = folder.absolute(), folder.absolute() / FILE
         self._database: sqlite3.Connection | None = None
-        self._stamp: tuple[int, int] | None = None  # of the file that is open
         with disk_errors_as_input_errors(self.folder):
             names = {path.name for path in folder.iterdir() if path.name[0] != "."} if folder.exists() else set()
         if names and FILE not in names:
@@ -64,28 +67,24 @@ class MapFile:
         query = "SELECT value, checksum FROM parts WHERE name = ?"
         with self._open() as database:
             row: tuple[bytes, int] | None = database and database.execute(query, [name]).fetchone()
-        if row is None:
-            return None
-        content, checksum = row
-        if zlib.crc32(content) != checksum:
+        if row is not None and zlib.crc32(row[0]) != row[1]:
             raise self._damage(f"the {name}")
-        return content
+        return None if row is None else row[0]
 
-    def entries(self, start: int) -> Iterator[tuple[int, Entry]]:
-        """(row, entry) of all rows from `start` on, in their order; an InputError if one is damaged or missing."""
-        query = "SELECT row, name, place, vector, checksum FROM entries WHERE row >= ? ORDER BY row"
-        with self._open() as database:
-            for row, name, place, vector, checksum in database.execute(query, [start]) if database else ():
-                if row != start or _checksum(name, place, vector) != checksum:
-                    raise self._damage(f"row {start}")
-                start += 1
-                yield row, Entry(json.loads(name), json.loads(place), np.frombuffer(vector, np.float32))
+    def entries(self, start: int) -> Iterator[tuple[Entry, int, float]]:
+        """Entries of all rows from `start` on, in their order, with the number and the strength of their keypoints.
 
-    def counts(self) -> np.ndarray:
-        """`[M]` numbers of keypoints of all rows."""
+        An InputError if one is damaged or missing.
+        """
+        query = "SELECT * FROM entries WHERE row >= ? ORDER BY row"
         with self._open() as database:
-            rows = database.execute("SELECT count FROM features ORDER BY row").fetchall() if database else []
-        return np.array(rows, int).reshape(-1)
+            rows: Iterable[Any] = database.execute(query, [start]) if database else ()
+            for number, (row, *values, checksum) in enumerate(rows, start):
+                if row != number or _checksum(values) != checksum:
+                    raise self._damage(f"row {number}")
+                name, place, keypoints, sum_of_scores, vector = values
+                entry = Entry(json.loads(name), json.loads(place), np.frombuffer(vector, np.float32))
+                yield entry, keypoints, sum_of_scores
 
     def features(self, rows: Sequence[int]) -> Iterator[tuple[int, Features]]:
         """(row, features) of existing rows, in their order; an InputError if one is damaged."""
@@ -113,85 +112,49 @@ class MapFile:
 
         When this returns it is on disk. An InputError if the disk is full or cannot be written.
         """
-        packed = list[tuple[Mapping[str, np.ndarray], Entry]]()
+        rows = list[tuple[tuple[Any, ...], bytes]]()
         for features, entry in images:
             try:
-                packed.append((pack_features(features), entry))
+                arrays = pack_features(features)
             except ValueError as error:
                 raise InputError(f"{entry.name}: {error}") from None
-        with self._open(create=True) as database:
-            assert database is not None
+            name, place = (json.dumps(value, allow_nan=False) for value in entry[:2])  # names may be no UTF-8
+            vector = np.asarray(entry.vector, np.float32).tobytes()
+            values = name, place, len(arrays["scores"]), strength(features), vector
+            rows.append((values, pack_arrays(arrays)))
+        with self._open(create=True) as database, database:  # which commits, or rolls back
             database.execute("BEGIN IMMEDIATE")
-            try:
-                if database.execute("PRAGMA user_version").fetchone()[0] == 0:
-                    for statement in _SCHEMA:
-                        database.execute(statement)
-                    database.execute(f"PRAGMA user_version = {_FORMAT}")
-                of_parts = [(name, content, zlib.crc32(content)) for name, content in parts.items()]
-                database.executemany("INSERT OR REPLACE INTO parts VALUES (?, ?, ?)", of_parts)
-                [first] = database.execute("SELECT coalesce(max(row) + 1, 0) FROM entries").fetchone()
-                for row, (arrays, entry) in enumerate(packed, first):
-                    name, place = (json.dumps(value, allow_nan=False) for value in entry[:2])  # names may be no UTF-8
-                    vector = np.asarray(entry.vector, np.float32).tobytes()
-                    values = row, name, place, time.time(), vector, _checksum(name, place, vector)
-                    database.execute("INSERT INTO entries VALUES (?, ?, ?, ?, ?, ?)", values)
-                    values = row, len(arrays["scores"]), pack_arrays(arrays)
-                    database.execute("INSERT INTO features VALUES (?, ?, ?)", values)
-                database.execute("COMMIT")
-            except BaseException:
-                if database.in_transaction:  # SQLite may have ended it
-                    database.execute("ROLLBACK")
-                raise
+            if database.execute("PRAGMA user_version").fetchone()[0] == 0:
+                for statement in (*_SCHEMA, f"PRAGMA user_version = {_FORMAT}"):
+                    database.execute(statement)
+            of_parts = [(name, content, zlib.crc32(content)) for name, content in parts.items()]
+            database.executemany("INSERT OR REPLACE INTO parts VALUES (?, ?, ?)", of_parts)
+            [first] = database.execute("SELECT coalesce(max(row) + 1, 0) FROM entries").fetchone()
+            for row, (values, content) in enumerate(rows, first):
+                database.execute("INSERT INTO entries VALUES (?, ?, ?, ?, ?, ?, ?)", (row, *values, _checksum(values)))
+                database.execute("INSERT INTO features VALUES (?, ?)", (row, content))
 
     @contextmanager
-    def _open(self, *, create: bool = False) -> Iterator[sqlite3.Connection | None]:
-        """The database, which stays open; None if there is no map yet. Errors are an InputError of one line."""
-        try:
-            with disk_errors_as_input_errors(self.folder):
-                status = self._path.stat() if self._path.exists() else None
-                if self._stamp is not None and (status is None or self._stamp != (status.st_dev, status.st_ino)):
-                    got = "another one that replaced it, or none. Open the map again"
-                    raise InputError(f"{self.folder}: expected the map that was opened, got {got}.")
-                if status is None and not create:
-                    yield None
-                    return
-                database = self._connect(create)
-                version = database.execute("PRAGMA user_version").fetchone()[0]
-                if version not in (0, _FORMAT):
-                    raise InputError(f"{self._path}: expected format {_FORMAT}, got {version}. Build the map again.")
-                yield database if version or create else None
-        except sqlite3.Error as error:
-            code = getattr(error, "sqlite_errorcode", 0)
-            if code & 0xFF == sqlite3.SQLITE_FULL or code == sqlite3.SQLITE_IOERR_SHMSIZE:
-                raise full_disk_error(self.folder) from None
-            if code & 0xFF in (sqlite3.SQLITE_CORRUPT, sqlite3.SQLITE_NOTADB):
-                raise self._damage(f"the file ({error})") from None
-            reason = f"cannot be used ({error}). Check the path, its permissions and its disk"
-            raise InputError(f"{self._path}: {reason}.") from None
-
-    def _connect(self, create: bool) -> sqlite3.Connection:
-        """The connection; without write access a new one, which sees what was added since."""
-        is_readonly = not create and not os.access(self.folder, os.W_OK)
-        if self._database is None or is_readonly:
-            how = "rwc" if create else "rw"
-            if is_readonly:  # `immutable` needs no files of a log beside it, but would not see the rows in one
-                how = "ro" if self._path.with_name(f"{FILE}-wal").exists() else "ro&immutable=1"
-            self.folder.mkdir(parents=True, exist_ok=True)
-            url, options = f"{self._path.as_uri()}?mode={how}", {"isolation_level": None, "check_same_thread": False}
-            self._database = sqlite3.connect(url, uri=True, timeout=_WAIT, **options)
-            weakref.finalize(self, self._database.close)
-            status = self._path.stat()
-            self._stamp = status.st_dev, status.st_ino
-        if create:
-            self._database.execute("PRAGMA journal_mode = WAL")
-        return self._database
+    def _open(self, *, create: bool = False) -> Iterator[Any]:
+        """The `sqlite3.Connection`, which stays open; None if there is no map yet. Errors are an InputError."""
+        with disk_errors_as_input_errors(self._path):
+            if self._database is None and (create or self._path.exists()):
+                self.folder.mkdir(parents=True, exist_ok=True)
+                url, options = f"{self._path.as_uri()}?mode=rw{'c' * create}", {"isolation_level": None, "uri": True}
+                self._database = sqlite3.connect(url, timeout=_WAIT, check_same_thread=False, **options)
+                weakref.finalize(self, self._database.close)
+            version = self._database.execute("PRAGMA user_version").fetchone()[0] if self._database else 0
+            if version not in (0, _FORMAT):
+                raise InputError(f"{self._path}: expected format {_FORMAT}, got {version}. Build the map again.")
+            yield self._database if version or create else None
 
     def _damage(self, what: str) -> InputError:
         return InputError(f"{self._path}: {what} is damaged. Put back a copy, or build the map again.")
 
 
-def _checksum(name: str, place: str, vector: bytes) -> int:
-    return zlib.crc32(vector, zlib.crc32(f"{name} {place}".encode()))
+def _checksum(values: Sequence[Any]) -> int:
+    *numbers, vector = values
+    return zlib.crc32(vector, zlib.crc32(repr(numbers).encode()))
 
 
 def check_entry(name: Any, place: Any) -> None:

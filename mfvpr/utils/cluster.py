@@ -42,7 +42,7 @@ class Cluster:
     their environment. Put extractors and matchers of your own into a module that workers can import.
 
     A scheduler runs the code that it gets. `local` and `slurm` encrypt its connections, by a key pair that only this
-    process and its workers have. The dashboard listens on 127.0.0.1: other users of the machine can read it.
+    process and its workers have. Other users of the machine can read the dashboard, which listens on 127.0.0.1.
     """
 
     def __init__(self, client: Any) -> None:
@@ -135,10 +135,9 @@ class Cluster:
         except distributed.KilledWorker as error:
             number = error.allowed_failures + 1
             raise InputError(f"cluster: {number} workers died in one block; give them more memory; {again}") from None
-        except distributed.scheduler.NoWorkerError:
-            raise InputError(f"cluster: no worker is left; {again}") from None
-        except (CancelledError, distributed.comm.CommClosedError):
-            raise InputError(f"cluster: the scheduler at {client.scheduler.address} is gone; {again}") from None
+        except (distributed.scheduler.NoWorkerError, CancelledError, distributed.comm.CommClosedError):
+            gone = f"no worker is left, or the scheduler at {client.scheduler.address} is gone"
+            raise InputError(f"cluster: {gone}; {again}") from None
         finally:
             for future in futures:
                 future.release()

@@ -40,26 +40,21 @@ def keep_compiled_programs(warn: Callable[[str], object] = warnings.warn) -> Non
         return
     try:
         folder.mkdir(0o755, parents=True, exist_ok=True)
-        masks = {folder: 0o022, folder.parent: 0o002, folder.parents[1]: 0o002}
-        foreign = [path for path, mask in masks.items() if _is_foreign(path.stat(), mask)]
+        states = {path: path.stat() for path in (folder, *folder.parents[:2])}
     except OSError:
         return
-    if foreign:
-        expected = "a folder that is yours and that nobody else can write to, as it holds machine code"
-        mend = "compiled programs are not kept; run `chmod go-w` on it, or set MFVPR_CACHE"
-        warn(f"{foreign[0]}: expected {expected}; {mend}")
-        os.environ[VARIABLE] = "false"  # also for later calls and child processes
-        return
+    for path, state in states.items():
+        others = 0o022 if path == folder else 0 if state.st_mode & stat.S_ISVTX else 0o002  # sticky, such as /tmp
+        if state.st_uid not in {0, os.getuid()} or state.st_mode & others:
+            expected = "a folder that is yours and that nobody else can write to, as it holds machine code"
+            mend = "compiled programs are not kept; run `chmod go-w` on it, or set MFVPR_CACHE"
+            warn(f"{path}: expected {expected}; {mend}")
+            os.environ[VARIABLE] = "false"  # also for later calls and child processes
+            return
     jax.config.update("jax_compilation_cache_dir", str(folder))
     seconds = 0.0 if os.access(folder, os.W_OK) else math.inf  # of a compilation, from which on it is written
     jax.config.update("jax_persistent_cache_min_compile_time_secs", seconds)
     compilation_cache.reset_cache()  # JAX looks for a folder once, at the first compilation
-
-
-def _is_foreign(status: os.stat_result, mask: int) -> bool:
-    """Whether another user may change a folder; in a sticky one, such as /tmp, only entries of his own."""
-    is_open = status.st_mode & mask and not (mask == 0o002 and status.st_mode & stat.S_ISVTX)
-    return bool(is_open) or status.st_uid not in {0, os.getuid()}
 
 
 def _folder() -> Path:

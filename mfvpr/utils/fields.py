@@ -13,11 +13,13 @@ Programs make their settings, what `--help` says about them, and the axes of swe
 import re
 from collections.abc import Callable, Mapping
 from dataclasses import Field, dataclass, field, fields, is_dataclass, replace
+from functools import partial
 from typing import Any, TypeVar, get_args
 
 import numpy as np
 
 from mfvpr.utils.errors import InputError
+from mfvpr.utils.files import clip_middle
 
 REQUIRED = "???"  # the default of a setting without one, in Hydra's words
 _KEY, _GROUP = "setting", "group"  # of the field's metadata
@@ -43,20 +45,16 @@ class Rule:
     def check(self, name: str, value: Any) -> None:
         """Raise an InputError for a value that is not allowed."""
         if not self.holds(value):
-            text = "null" if value is None else " ".join(str(value).split())
-            text = text if len(text) <= _MAX_SHOWN else f"{text[: _MAX_SHOWN // 2]}..."
-            raise InputError(f"{name}={text}: expected {self.expected}")
+            got = "null" if value is None else clip_middle(" ".join(str(value).split()), _MAX_SHOWN)
+            raise InputError(f"{name}={got}: expected {self.expected}")
 
 
 def one_of(*choices: Any) -> Rule:
     """Some words, numbers, flags or None."""
-    words = (
-        "null" if choice is None else str(choice).lower() if isinstance(choice, bool) else str(choice)
-        for choice in choices
-    )
+    plain = {None: "null", True: "true", False: "false"}
+    words = ", ".join(plain[each] if each is None or isinstance(each, bool) else str(each) for each in choices)
     return Rule(
-        lambda value: any(type(value) is type(choice) and value == choice for choice in choices),
-        "one of " + ", ".join(words),
+        lambda value: any(type(value) is type(choice) and value == choice for choice in choices), f"one of {words}"
     )
 
 
@@ -72,21 +70,17 @@ def text(pattern: str = r"(?s).+", expected: str = "text") -> Rule:
 
 def number(low: float, high: float) -> Rule:
     """A number in a range, its ends included."""
-
-    def holds(value: Any) -> bool:
-        is_number = isinstance(value, int | float | np.number) and not isinstance(value, bool)
-        return is_number and bool(low <= value <= high)
-
-    return Rule(holds, f"a number from {low:g} to {high:g}", (low, high))
+    return Rule(partial(_holds, int | float | np.number, low, high), f"a number from {low:g} to {high:g}", (low, high))
 
 
 def whole(low: int, high: int) -> Rule:
     """An integer in a range, its ends included."""
-
-    def holds(value: Any) -> bool:
-        return isinstance(value, int | np.integer) and not isinstance(value, bool) and bool(low <= value <= high)
-
+    holds = partial(_holds, int | np.integer, low, high)
     return Rule(holds, f"a whole number from {low} to {high}", (low, high), is_whole=True)
+
+
+def _holds(kind: Any, low: float, high: float, value: Any) -> bool:
+    return isinstance(value, kind) and not isinstance(value, bool) and bool(low <= value <= high)
 
 
 def list_of(rule: Rule, length: int = 0) -> Rule:
@@ -149,12 +143,10 @@ def setting(default: Any, rule: Rule, note: str = "", *, static: bool = False, r
     `static` fields of a scorer are no leaves. Fields without `recipe` change no result. `more` are attributes of
     `Setting`.
     """
-    plain = None if default == more.get("none") else default
-    plain = [*default] if isinstance(default, tuple) else plain
+    plain = None if default == more.get("none") else [*default] if isinstance(default, tuple) else default
     metadata = {_KEY: Setting(plain, rule, note, **more), "static": static, "recipe": recipe}
-    if callable(default):
-        return field(default_factory=default, metadata=metadata)
-    return field(default=default, metadata=metadata)
+    made: Any = {"default_factory" if callable(default) else "default": default}
+    return field(**made, metadata=metadata)
 
 
 def settings_of(owner: type) -> dict[str, Any]:
@@ -216,12 +208,13 @@ def check_values(known: Mapping[str, Setting], values: Mapping[str, Any], prefix
 
 def check_fields(owner: Any) -> None:
     """Raise an InputError for a field whose value its rule does not allow; arrays are not looked at."""
+    plain = bool | int | float | np.integer | str | list | Mapping | None
     for each in fields(owner):
         value, about = getattr(owner, each.name), each.metadata.get(_KEY)
-        if about is not None and callable(each.default) and not callable(value):  # words are for the command line
+        if about is None:
+            continue
+        if callable(each.default) and not callable(value):  # words are for the command line
             raise InputError(f"{each.name}={value!r}: expected a weight such as RatioWeight()")
         parts = value if isinstance(value, list | tuple) else (value,)
-        plain = bool | int | float | np.integer | str | list | Mapping | None
-        is_plain = all(isinstance(part, plain) for part in parts)
-        if about is not None and is_plain and (about.none is None or value != about.none):
+        if all(isinstance(part, plain) for part in parts) and (about.none is None or value != about.none):
             about.rule.check(each.name, value)

@@ -13,11 +13,8 @@ IMAGE_SUFFIXES = frozenset({".jpg", ".jpeg", ".png", ".bmp", ".tif", ".tiff", ".
 
 
 @contextmanager
-def replacing(path: Path, *, once: bool = False) -> Iterator[Path]:
-    """A temporary path beside `path` (same suffix) that replaces it when the block ends without an error.
-
-    If `once`, an existing file stays: of several processes at the same time, the first counts.
-    """
+def replacing(path: Path) -> Iterator[Path]:
+    """A temporary path beside `path` (same suffix) that replaces it when the block ends without an error."""
     path.parent.mkdir(parents=True, exist_ok=True)
     handle, name = tempfile.mkstemp(prefix=f".{path.stem}-", suffix=path.suffix, dir=path.parent)
     os.fchmod(handle, 0o644)  # mkstemp's 0600 would surprise whoever shares the folder
@@ -25,11 +22,7 @@ def replacing(path: Path, *, once: bool = False) -> Iterator[Path]:
     temporary = Path(name)
     try:
         yield temporary
-        if once:
-            with suppress(FileExistsError):
-                os.link(temporary, path)
-        else:
-            os.replace(temporary, path)
+        os.replace(temporary, path)
     finally:
         temporary.unlink(missing_ok=True)
 
@@ -79,9 +72,9 @@ def clip_middle(text: str, most: int) -> str:
     return text if len(text) <= most else f"{text[:half]}\N{HORIZONTAL ELLIPSIS}{text[-half:]}"
 
 
-def write_text(path: Path, text: str, *, once: bool = False) -> None:
-    """Write `printable` text as UTF-8, atomically; if `once`, only if there is no file."""
-    with replacing(path, once=once) as temporary:
+def write_text(path: Path, text: str) -> None:
+    """Write `printable` text as UTF-8, atomically."""
+    with replacing(path) as temporary:
         temporary.write_text(printable(text), encoding="utf-8")
 
 

@@ -42,7 +42,7 @@ def recipe_of(value: Any, of_path: Callable[[PurePath], Any] = str) -> Any:
     """
     value = value.item() if isinstance(value, np.number) else value
     if value is None or isinstance(value, bool | int | float | str):
-        return value if not isinstance(value, float) or math.isfinite(value) else str(value)
+        return str(value) if isinstance(value, float) and not math.isfinite(value) else value
     if isinstance(value, Mapping):
         return {str(name): recipe_of(part, of_path) for name, part in value.items()}
     if isinstance(value, list | tuple):
@@ -50,9 +50,13 @@ def recipe_of(value: Any, of_path: Callable[[PurePath], Any] = str) -> Any:
     if isinstance(value, PurePath):
         return of_path(value)
     kind = type(value)
-    is_ours = kind.__module__.partition(".")[0] == _LIBRARY
+    is_ours = _is_ours(kind)
     parts: dict[str, Any] = {"class": kind.__qualname__ if is_ours else f"{kind.__module__}.{kind.__qualname__}"}
-    if names_recipe := _names_recipe(value, is_ours):
+    names_recipe = hasattr(value, "recipe") and not isinstance(value, type)
+    if names_recipe and not is_ours:  # the recipe of one of our classes says nothing about a user's subclass
+        owners = [each for each in kind.__mro__ if "recipe" in vars(each)]
+        names_recipe = not owners or not _is_ours(owners[0])
+    if names_recipe:
         parts["recipe"] = recipe_of(value.recipe, of_path)
     if is_dataclass(kind) and is_ours != names_recipe:  # one of ours that names its recipe says everything by it
         for field in fields(kind):
@@ -73,12 +77,8 @@ def recipe_of(value: Any, of_path: Callable[[PurePath], Any] = str) -> Any:
     return ({} if is_leaf else parts) | {"sha256": content_hash(_ADDRESS.sub("", str(structure)), leaves)}
 
 
-def _names_recipe(value: Any, is_ours: bool) -> bool:
-    """Whether a value names its recipe itself: that of one of our classes says nothing about a user's subclass."""
-    if isinstance(value, type) or not hasattr(value, "recipe"):
-        return False
-    owner = next((kind for kind in type(value).__mro__ if "recipe" in vars(kind)), None)
-    return is_ours or owner is None or owner.__module__.partition(".")[0] != _LIBRARY
+def _is_ours(kind: type) -> bool:
+    return kind.__module__.partition(".")[0] == _LIBRARY
 
 
 def fingerprint(recipe: Any) -> str:
@@ -100,8 +100,5 @@ def content_hash(*parts: Any) -> str:
 @cache
 def versions() -> dict[str, str]:
     """Versions of Python, of mfvpr and of the packages, by name."""
-    return {
-        "mfvpr": __version__,
-        "python": platform.python_version(),
-        **{package: version(package) for package in _PACKAGES},
-    }
+    packages = {package: version(package) for package in _PACKAGES}
+    return {"mfvpr": __version__, "python": platform.python_version(), **packages}

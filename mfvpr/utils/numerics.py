@@ -29,7 +29,6 @@ _CPUINFO = Path("/proc/cpuinfo")
 _HOST = 1  # DLPack's number of the processor
 
 Function = TypeVar("Function", bound=Callable[..., Any])
-Tree = TypeVar("Tree")
 
 
 def masked(values: Shaped[Array, "..."], mask: Bool[Array, "..."], fill: ArrayLike = 0.0) -> Shaped[jax.Array, "..."]:
@@ -51,10 +50,8 @@ def as_array(values: Any) -> Any:
     if np.ma.is_masked(values):
         mend = "leave them out, for instance by array.compressed()"
         raise InputError(f"arrays: expected arrays without a mask of NumPy, got masked entries; {mend}")
-    if isinstance(values, list | tuple):
-        return np.asarray(values)
     if not _is_foreign(values):
-        return values
+        return np.asarray(values) if isinstance(values, list | tuple) else values
     values = values.detach() if hasattr(values, "detach") else values  # torch exports no tensor that needs a gradient
     on_host = values.__dlpack_device__()[0] == _HOST
     try:
@@ -104,8 +101,7 @@ def masked_mean(
 def masked_median(values: Float[Array, " entries *rest"], mask: Bool[Array, " entries"]) -> Float[jax.Array, "*rest"]:
     """Median of `values` over axis 0 where `mask` is True (mean of the middle two when even); 0 if there are none.
 
-    Example:
-        mfvpr.masked_median(jnp.array([1.0, 9.0, 2.0, 7.0]), jnp.array([True, False, True, True]))  # 2.0
+    mfvpr.masked_median(jnp.array([1.0, 9.0, 2.0, 7.0]), jnp.array([True, False, True, True]))  # 2.0
     """
     if len(mask) == 0:
         return jnp.zeros(values.shape[1:], values.dtype)
@@ -150,27 +146,20 @@ def compiled(function: Function, **options: Any) -> Function:
 
     @wraps(function)
     def call(*arguments: Any, **named: Any) -> Any:
-        leaves, classes = leaves_and_classes((arguments, named))
+        nodes: list[Any] = []  # parents first
+        leaves = jax.tree.leaves((arguments, named), is_leaf=lambda node: bool(nodes.append(node)))  # never true
         if any(map(_is_foreign, leaves)):
             arguments, named = jax.tree.map(as_array, (arguments, named))
         if any(map(callable, leaves)):
             return function(*arguments, **named)
+        # Up to jaxlib 0.10 tree structures are equal whatever the classes that `register_dataclass` registered.
+        of_leaves = set(map(type, leaves))
+        classes = tuple([cls for cls in map(type, nodes) if cls not in of_leaves])
         if classes not in programs:  # `jit` shares programs between equal functions, and a `partial` equals no other
             programs.setdefault(classes, jax.jit(partial(function), **options))
         return programs[classes](*arguments, **named)
 
     return call  # pyright: ignore[reportReturnType]
-
-
-def leaves_and_classes(tree: Any) -> tuple[list[Any], tuple[type, ...]]:
-    """The leaves of a pytree, and the classes of its nodes, parents first.
-
-    Up to jaxlib 0.10 tree structures are equal whatever the classes that `jax.tree_util.register_dataclass` registered.
-    """
-    seen: list[Any] = []
-    leaves = jax.tree.leaves(tree, is_leaf=lambda node: bool(seen.append(node)))  # called for every node; never true
-    of_leaves = set(map(type, leaves))
-    return leaves, tuple([cls for cls in map(type, seen) if cls not in of_leaves])
 
 
 def holds_function(tree: Any) -> bool:
@@ -202,9 +191,7 @@ def has_bfloat16() -> bool:
 
 def available_cpus() -> int:
     """Processors that this process may use: a scheduler or container may give fewer than the machine has."""
-    if hasattr(os, "sched_getaffinity"):  # Linux
-        return len(os.sched_getaffinity(0))
-    return os.cpu_count() or 1
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 def device_bytes(tree: Any) -> int | None:
@@ -215,9 +202,8 @@ def device_bytes(tree: Any) -> int | None:
 
 def free_bytes(device: Device) -> int:
     """Free bytes in the memory of a device: its own, or the machine's."""
-    if stats := device.memory_stats():
-        return stats["bytes_limit"] - stats["bytes_in_use"]
-    return free_host_bytes()
+    stats = device.memory_stats()
+    return stats["bytes_limit"] - stats["bytes_in_use"] if stats else free_host_bytes()
 
 
 def free_host_bytes() -> int:

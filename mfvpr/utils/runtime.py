@@ -56,10 +56,9 @@ class Runtime:
         label: str,
         multiple: int,
     ) -> Iterator[Result]:
-        """Results of `function(*shared, rows)`, one for each row; with a cluster, of `function(*shared, block)`.
+        """Results of `function(*shared, rows)`, one for each row, with progress; with a cluster, block by block.
 
-        With a cluster, results come block by block, as blocks finish; the rows of a block are a multiple of `multiple`,
-        but for the last. The progress has this label.
+        Blocks come as they finish; the rows of a block are a multiple of `multiple`, but for the last.
         """
         cluster = self.cluster
         results = function(*shared, rows) if cluster is None else cluster.map(function, shared, rows, multiple)
@@ -91,17 +90,15 @@ class Stopwatch:
 
 def ordered_map(function: Callable[[Item], Result], items: Iterable[Item], *, workers: int) -> Iterator[Result]:
     """`map` on threads, for work that releases the interpreter lock: in order, at most 2 x `workers` ahead."""
-    remaining = iter(items)
+    remaining, futures = iter(items), deque[Future[Result]]()
     with ThreadPoolExecutor(workers) as pool:
-        futures: deque[Future[Result]] = deque(
-            pool.submit(function, item) for item in itertools.islice(remaining, 2 * workers)
-        )
         try:
-            while futures:
-                result = futures.popleft().result()
-                for item in itertools.islice(remaining, 1):
-                    futures.append(pool.submit(function, item))
-                yield result
+            while True:
+                next_items = itertools.islice(remaining, 2 * workers - len(futures))
+                futures.extend(pool.submit(function, item) for item in next_items)
+                if not futures:
+                    return
+                yield futures.popleft().result()
         finally:
             for future in futures:
                 future.cancel()

@@ -105,8 +105,9 @@ def test_a_block_that_kills_every_worker_ends_the_call_and_not_the_cluster(datas
     extractor = FatalSift(max_keypoints=60, image_size=(160, 120), batch_size=3)
     cache = FeatureCache(tmp_path, runtime=Runtime(cluster=cluster))
     with pytest.raises(InputError, match="cluster: 4 workers died in one block"):
-        cache.describe(dataset.database, extractor)
-    assert (cache.describe(dataset.database, SIFT).counts > 0).all()
+        cache.local(dataset.database, extractor)
+    [features] = cache.local(dataset.database, SIFT)
+    assert (features.counts > 0).all()
 
 
 def test_a_cluster_needs_a_folder(dataset, cluster):

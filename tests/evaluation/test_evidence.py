@@ -8,9 +8,10 @@ import pytest
 
 from mfvpr.core.types import Features, Shortlist
 from mfvpr.datasets.image_reading import read_image, resize
-from mfvpr.evaluation.evidence import evidence_against, reason_against_image, strength
+from mfvpr.evaluation.evidence import evidence_against, reason_against_image
 from mfvpr.evaluation.rankings import Ranked
 from mfvpr.evaluation.system import noise_images
+from mfvpr.features.feature_set import strength
 from mfvpr.retrieval import FeatureFiles
 from tests.builders import make_matches, match_set_of
 

@@ -16,7 +16,7 @@ from mfvpr.matchers import match_set as match_sets
 from mfvpr.retrieval import Retrieval
 from mfvpr.retrieval.search import EXACT
 from mfvpr.storage import FeatureCache
-from mfvpr.storage.cache_files import MatchStore, StoredMatches
+from mfvpr.storage.cache_files import MatchStore
 from mfvpr.tuning.sweeps import rank_settings
 from tests.builders import match_set_of, random_matches
 from tests.scorers import FOREIGN, OWN, one_of_each_class, title
@@ -54,7 +54,7 @@ def test_a_store_gives_what_was_matched_and_is_read_ever_after(features, candida
     again = stages.match(features[1], features[0], candidates, store=store, runtime=runtime)
     alone, stored = stages.stored_matches(store)
     read_again, _ = stages.stored_matches(store, memory=1e-5)
-    assert isinstance(read_again.matches, StoredMatches)
+    assert isinstance(read_again.matches, MatchStore)
     assert len(read_again.matches) == len(first)
     assert_same_match_sets(first, matches)
     assert ((first[0].ratio > 0) == first[0].mask).all()

@@ -1,4 +1,4 @@
-"""A map's file when processes are killed, read while one adds, or find flipped bytes."""
+"""A map's file when processes are killed, read while one adds, find flipped bytes, or fill the disk."""
 
 import os
 import random
@@ -6,17 +6,26 @@ import signal
 import subprocess
 import sys
 import time
+from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
 
 from mfvpr import InputError
+from mfvpr.datasets import image_folder
+from mfvpr.datasets.streets import streets_folder
+from mfvpr.features import Sift, VladFitting
+from mfvpr.localization import Map
+from mfvpr.storage.cache_files import round_as_stored
 from mfvpr.storage.maps import FILE, Entry, MapFile
-from mfvpr.storage.packing import round_as_stored
+from tests.builders import map_system
 from tests.programs import ROOT
+from tests.small_disks import UNSHARE, mount, need_small_disks
 from tests.storage.synthetic_features import assert_same, features_of
 
 pytestmark = pytest.mark.thorough
+SMALL_SIFT = Sift(max_keypoints=200, image_size=(160, 120))
 
 
 def image_of(row):
@@ -26,7 +35,7 @@ def image_of(row):
 def add(folder, number, log=None):
     """Add rows until the map has so many, and write a line for each."""
     file = MapFile(folder)
-    for row in range(len(file.counts()), number):
+    for row in range(len([*file.entries(0)]), number):
         file.write({}, [image_of(row)])
         if log is not None:
             os.write(log, b".\n")
@@ -34,10 +43,9 @@ def add(folder, number, log=None):
 
 def assert_whole(folder, least):
     file = MapFile(folder)
-    entries = dict(file.entries(0))
+    entries = [entry for entry, _, _ in file.entries(0)]
     assert len(entries) >= least
-    assert len(file.counts()) == len(entries)
-    for row, features in file.features([*entries]):
+    for row, features in file.features(range(len(entries))):
         name, place, vector = image_of(row)[1]
         assert entries[row][:2] == (name, place)
         np.testing.assert_array_equal(entries[row].vector, vector)
@@ -83,8 +91,8 @@ def test_readers_see_whole_rows_in_order_while_one_adds(tmp_path):
 from tests.localization.test_kills import *
 file, seen = MapFile(Path({str(folder)!r})), 0
 while seen < 200:
-    for row, entry in file.entries(seen):
-        assert (row, entry.name) == (seen, str(seen))
+    for entry, count, _ in file.entries(seen):
+        assert (entry.name, count) == (str(seen), 40)
         seen += 1
     for row, features in file.features([seen - 1]):
         np.testing.assert_array_equal(features.keypoints, features_of(row).keypoints)
@@ -124,8 +132,8 @@ def test_flipped_bytes_are_named(tmp_path, part):
 
 def test_a_file_of_something_else_is_one_line(tmp_path):
     (tmp_path / FILE).write_bytes(b"no database " * 1000)
-    with pytest.raises(InputError, match=r"map\.sqlite: the file \(file is not a database\) is damaged"):
-        MapFile(tmp_path).counts()
+    with pytest.raises(InputError, match=r"map\.sqlite: cannot be used \(file is not a database\)"):
+        MapFile(tmp_path).part("system")
 
 
 def test_a_map_that_may_only_be_read(tmp_path):
@@ -137,12 +145,34 @@ def test_a_map_that_may_only_be_read(tmp_path):
         os.chmod(tmp_path, 0o700)
 
 
-def test_without_write_access_the_rows_in_the_log_are_there(tmp_path, monkeypatch):
-    writer = MapFile(tmp_path)
-    writer.write({"system": b"{}"}, [image_of(0)])
-    assert (tmp_path / f"{FILE}-wal").exists()
-    monkeypatch.setattr(os, "access", lambda *_: False)
-    reader = MapFile(tmp_path)
-    assert len(reader.counts()) == 1
-    writer.write({}, [image_of(1)])
-    assert [row for row, _ in reader.entries(0)] == [0, 1]
+def fill(disk, street):
+    """Add images until the disk is full, localize, and go on when it has grown."""
+    disk, street = Path(disk), Path(street)
+    images, system = image_folder(street / "database"), map_system(SMALL_SIFT, VladFitting(num_words=8))
+    mount(disk, "-o", "size=600k")
+    known = Map(disk / "map", system)
+    known.learn(replace(images, names=images.names[:4]))
+
+    def add_missing():
+        for name, path in zip(images.names, images.paths, strict=True):
+            if name not in known.names:
+                known.add(path, name, name=name)
+
+    for _ in range(2):
+        with pytest.raises(InputError, match=f"^{disk}/map/map.sqlite: the disk is full; free some space [^\\n]*$"):
+            add_missing()
+        assert 2 <= len(known) < 12
+        assert known.localize(images.paths[0]).place == "0000.png"
+    mount(disk, "-o", "remount,size=20m")
+    add_missing()
+    assert [known.localize(path).place for path in images.paths] == list(images.names)
+
+
+@pytest.mark.slow
+def test_on_a_full_disk_images_stay_and_adding_goes_on(tmp_path):
+    need_small_disks(tmp_path)
+    street = streets_folder(tmp_path / "data", num_frames=12, image_size=(160, 120))
+    (tmp_path / "disk").mkdir()
+    code = f"from tests.localization.test_kills import fill; fill({str(tmp_path / 'disk')!r}, {str(street)!r})"
+    done = subprocess.run([*UNSHARE, sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr

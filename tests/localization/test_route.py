@@ -8,13 +8,12 @@ import pytest
 from mfvpr.evaluation.drives import Evidence, follow
 from mfvpr.evaluation.rankings import Ranked
 from mfvpr.localization import Alternative, Drive, Prediction, Route, route
-from mfvpr.utils import InputError
 
 
 def prediction(scores, p=None):
     """A prediction with scores by row."""
     alternatives = tuple(Alternative(row, str(row), row, score) for row, score in scores.items())
-    return Prediction(None, alternatives, 0.0, p, None, None)
+    return Prediction(alternatives=alternatives, confidence=p)
 
 
 def sharp(row, p=1.0):
@@ -65,15 +64,6 @@ def test_a_wrong_speed_is_a_warning_and_a_right_one_is_none():
         follow(1.0)
 
 
-def test_a_speed_that_was_right_for_long_and_is_wrong_now_is_a_warning():
-    lines, there = [], np.ones(300, bool)
-    drive_route = Route(Drive(1.0), warn=lines.append)
-    for row in [*range(100), *range(100, 124, 4)]:
-        assert row > 100 or not lines
-        drive_route(sharp(row, 0.6), there)
-    assert len(lines) == 1
-
-
 @pytest.mark.parametrize("advance", [3, -2, 0])
 def test_a_sure_robot_moves_as_its_drive_says(advance):
     there, drive_route = np.ones(60, bool), Route(Drive(advance, 0.05, 0.0))
@@ -100,7 +90,7 @@ def test_it_finds_a_robot_that_was_carried_away():
 
 
 def refusal(reason="too few matches"):
-    return Prediction(None, (), 0.0, None, None, None, reason)
+    return Prediction(reason=reason)
 
 
 def test_ten_refused_images_are_off_the_map_and_five_are_not():
@@ -159,11 +149,3 @@ def test_the_map_may_grow_and_costs_few_programs(compilations):
     assert compilations.count == 0
     assert drive_route(sharp(1500), np.ones(1600, bool)).row == 1500
     assert len(drive_route.belief) == 2 * route.FIRST_ROWS
-
-
-@pytest.mark.parametrize("incorrect", [
-    {"advance": math.nan}, {"spread": 0}, {"spread": math.inf}, {"kidnapped": 1.1}, {"leaves": -0.1}, {"returns": 0},
-])  # fmt: skip
-def test_drives_that_cannot_be(incorrect):
-    with pytest.raises(InputError, match=r"Drive\("):
-        Drive(**incorrect)

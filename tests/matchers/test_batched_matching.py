@@ -24,7 +24,7 @@ from mfvpr.features import FeatureSet, InMemory
 from mfvpr.matchers import NearestNeighborMatcher
 from mfvpr.matchers import batched_matching as batched
 from mfvpr.matchers.match_set import batches, shapes, slots, split_rows
-from mfvpr.storage.packing import round_as_stored
+from mfvpr.storage.cache_files import round_as_stored
 from tests.builders import make_features, make_shortlist
 from tests.features.test_feature_set import Counting
 

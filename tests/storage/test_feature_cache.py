@@ -2,7 +2,6 @@
 
 import shutil
 from dataclasses import dataclass, replace
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -19,6 +18,7 @@ from tests.storage.extractors import SIFT, Counted, Mean, TwoScales, first_featu
 from tests.storage.synthetic_features import DAMAGE, assert_same
 
 pytestmark = pytest.mark.thorough
+ON_DISK = pytest.mark.parametrize("on_disk", [True, False])
 
 
 @pytest.fixture(scope="module")
@@ -49,7 +49,7 @@ def test_what_was_extracted_is_read_ever_after(folder, tmp_path):
             np.testing.assert_allclose(getattr(first, name), getattr(exact, name), atol=tolerance)
 
 
-@pytest.mark.parametrize("on_disk", [True, False])
+@ON_DISK
 def test_only_what_is_asked_for_is_extracted_and_nothing_twice(folder, tmp_path, on_disk):
     extractor, cache = Counted(), FeatureCache(tmp_path if on_disk else None)
     for rows, seen in (([7, 2], 2), ([2], 2), ([2, 3, 7], 3), ([], 3)):
@@ -75,7 +75,7 @@ class Fewer:
         return [Description(None, (first_features(each.features, self.number),)) for each in SIFT(images)]
 
 
-@pytest.mark.parametrize("on_disk", [True, False])
+@ON_DISK
 def test_an_extractor_that_was_changed_is_another_one(folder, tmp_path, on_disk):
     extractor, cache = Fewer(5), FeatureCache(tmp_path if on_disk else None)
     for number in (5, 9, 5):
@@ -84,7 +84,7 @@ def test_an_extractor_that_was_changed_is_another_one(folder, tmp_path, on_disk)
         assert features.counts.tolist() == [number] * len(folder)
 
 
-@pytest.mark.parametrize("on_disk", [True, False])
+@ON_DISK
 def test_images_are_known_by_their_content(folder, tmp_path, on_disk):
     """Take parts of a folder, other names, and an image that is there twice."""
     extractor, cache = Counted(), FeatureCache(tmp_path / "s" if on_disk else None)
@@ -126,8 +126,8 @@ def test_what_another_version_decodes_are_other_images(monkeypatch):
     assert Recipes(None).of_features(SIFT) != recipe
 
 
-@pytest.mark.parametrize("on_disk", [True, False])
-def test_files_that_were_changed_are_looked_at_again(tmp_path, on_disk, small_street, monkeypatch):
+@ON_DISK
+def test_files_that_were_changed_are_looked_at_again(tmp_path, on_disk, small_street):
     root = tmp_path / "images"
     shutil.copytree(small_street / "database", root)
     cache, folder = FeatureCache(tmp_path / "s" if on_disk else None), image_folder(root)
@@ -139,14 +139,6 @@ def test_files_that_were_changed_are_looked_at_again(tmp_path, on_disk, small_st
     [expected] = FeatureCache(tmp_path / "other" if on_disk else None).local(folder, SIFT)
     assert_same_features(after, expected)
     assert not np.array_equal(before.keypoints, after[1].keypoints)
-    monkeypatch.chdir(small_street)
-    here = replace(folder, root=Path("database"))
-    [first] = cache.local(here, SIFT)
-    monkeypatch.chdir(tmp_path)
-    (tmp_path / "images").rename(tmp_path / "database")
-    [second] = cache.local(here, SIFT)
-    assert_same_features(second, expected)
-    assert not np.array_equal(first[1].keypoints, second[1].keypoints)
 
 
 def test_one_pass_gives_a_vector_and_several_scales(folder, tmp_path):
@@ -180,8 +172,7 @@ def test_bad_images_are_tried_again_by_the_next_run(tmp_path):
     good = (images / "b.png").read_bytes()
     (images / "b.png").write_bytes(b"")
     folder, cache = image_folder(images), FeatureCache(tmp_path / "s", skip_bad=True)
-    for _ in range(2):
-        assert list(cache.local(folder, SIFT)[0].bad) == [1]
+    assert list(cache.local(folder, SIFT)[0].bad) == [1]
     (images / "b.png").write_bytes(good)
     [features] = FeatureCache(tmp_path / "s", skip_bad=True).local(folder, SIFT)
     assert features.bad == {}
@@ -207,18 +198,6 @@ def colors(tmp_path):
     return image_folder(root)
 
 
-def test_global_descriptors_are_stored_as_well(colors, tmp_path):
-    mean = Counted(Mean())
-    plain = FeatureCache(skip_bad=True).vectors(colors, mean, colors)
-    runs = [FeatureCache(tmp_path / "s", skip_bad=True).vectors(colors, mean, colors) for _ in range(2)]
-    assert mean.seen == 3 + 3
-    for descriptors in runs:
-        np.testing.assert_array_equal(descriptors.values, plain.values)
-        assert list(descriptors.bad) == [2]
-    assert np.isnan(plain.values[2]).all()
-    np.testing.assert_allclose(np.linalg.norm(plain.values[[0, 1, 3]], axis=1), 1, rtol=1e-5)
-
-
 class Dark(Mean):
     """Divides by the mean color, which is not finite where all is black."""
 
@@ -229,9 +208,14 @@ class Dark(Mean):
             return [Description(vector) for vector in (1 / images.mean((1, 2))).astype(np.float32)]
 
 
-@pytest.mark.parametrize("on_disk", [True, False])
-def test_images_without_a_global_descriptor_are_listed(colors, tmp_path, on_disk):
-    descriptors = FeatureCache(tmp_path / "s" if on_disk else None, skip_bad=True).vectors(colors, Dark(), colors)
+@ON_DISK
+def test_global_descriptors_are_stored_as_well_and_images_without_one_are_listed(colors, tmp_path, on_disk):
+    dark = Counted(Dark())
+    for seen in (3, 4):  # the black image is tried again
+        descriptors = FeatureCache(tmp_path / "s", skip_bad=True).vectors(colors, dark, colors)
+        assert dark.seen == seen
+    if not on_disk:
+        descriptors = FeatureCache(skip_bad=True).vectors(colors, Dark(), colors)
     assert sorted(descriptors.bad) == [1, 2]
     assert "b.png: features are not finite" in descriptors.bad[1]
     assert np.isnan(descriptors.values).any(axis=1).tolist() == [False, True, True, False]
@@ -250,7 +234,7 @@ def test_aggregations_are_fitted_on_the_database(folder, small_street, tmp_path)
 def test_a_damaged_file_is_made_again_with_a_warning(folder, tmp_path):
     lines, extractor = [], Counted()
     [before] = FeatureCache(tmp_path).local(folder, extractor)
-    [path] = (tmp_path / "Counted-0").parent.glob(f"Counted-*/*/{before.source.descriptions.keys[3][2:]}.npz")
+    [path] = (tmp_path / "Counted-0").parent.glob(f"Counted-*/*/{before.source.keys[3][2:]}.npz")
     DAMAGE["flipped"](path)
     [again] = FeatureCache(tmp_path, runtime=Runtime(log=lines.append)).local(folder, extractor)
     assert lines[0] == f"warning: {path}: is damaged; made again"

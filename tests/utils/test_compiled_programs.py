@@ -1,14 +1,16 @@
-"""Compiled programs stay on disk between processes, for one processor and version."""
+"""Compiled programs stay on disk between processes, for one processor and version; processors and memory."""
 
 import os
 import subprocess
 import sys
+from pathlib import Path
 
 import jax
 import pytest
 from jax.experimental.compilation_cache import compilation_cache
 
 from mfvpr.utils import compiled_programs, numerics
+from mfvpr.utils.numerics import available_cpus, free_host_bytes
 from tests.programs import ROOT
 
 PROGRAM = """
@@ -54,10 +56,7 @@ def test_nothing_is_written_if_the_user_says_so(tmp_path):
     own = str(tmp_path / "own")
     assert run(tmp_path, JAX_COMPILATION_CACHE_DIR=own)[1:] == ["False", own]
     assert not (tmp_path / "compiled").exists()
-
-
-def test_a_folder_that_cannot_be_made_costs_only_the_compilation(tmp_path):
-    (tmp_path / "file").touch()
+    (tmp_path / "file").touch()  # below which no folder can be made
     assert run(tmp_path / "file") == ["25.0", "False", "None"]
 
 
@@ -106,13 +105,9 @@ def test_machine_code_of_others_is_not_read(keep, monkeypatch, tmp_path, case):
         assert used is None
 
 
-def test_ones_own_folder_below_tmp_is_used_with_the_usual_umask(keep, tmp_path):
+def test_ones_own_folder_below_tmp_is_used(keep, tmp_path):
     tmp_path.chmod(0o1777)
-    before = os.umask(0o002)  # which lets the group write
-    try:
-        assert keep() == ([], str(compiled_programs._folder()))
-    finally:
-        os.umask(before)
+    assert keep() == ([], str(compiled_programs._folder()))
 
 
 def test_processors_and_versions_have_folders_of_their_own(monkeypatch, tmp_path):
@@ -127,3 +122,17 @@ def test_processors_and_versions_have_folders_of_their_own(monkeypatch, tmp_path
     folders.append(compiled_programs._folder())
     assert folders[0] == folders[2]
     assert len({*folders}) == 4
+
+
+def test_any_system_has_free_memory(monkeypatch):
+    assert free_host_bytes() > 10**7
+    monkeypatch.setattr(Path, "read_text", lambda _: "something else")
+    assert free_host_bytes() > 10**7
+
+
+def test_processors_are_those_that_this_process_may_use(monkeypatch):
+    monkeypatch.setattr("os.sched_getaffinity", lambda _: {3, 5, 8}, raising=False)
+    assert available_cpus() == 3
+    monkeypatch.delattr("os.sched_getaffinity")
+    monkeypatch.setattr("os.cpu_count", lambda: None)
+    assert available_cpus() == 1

@@ -80,17 +80,9 @@ def test_without_a_recipe_there_is_none(part):
 
 
 def test_classes_of_the_library_are_known_by_name_and_fields():
-    sift = Sift()
-    parts = [
-        sift,
-        VladFitting(),
-        Vlad(np.ones((2, 3), np.float32)),
-        NearestNeighborMatcher(),
-        WEIGHTS,
-        ExactSearch(),
-        Retrieval(Aggregated(sift, VladFitting())),
-        {n: scorer() for n, scorer in SCORERS.items()},
-    ]
+    sift, vlad = Sift(), Vlad(np.ones((2, 3), np.float32))
+    parts = [sift, VladFitting(), vlad, NearestNeighborMatcher(), WEIGHTS, Retrieval(Aggregated(sift, VladFitting()))]
+    parts.append({name: scorer() for name, scorer in SCORERS.items()})
     assert len({fingerprint(recipe_of(part)) for part in parts}) == len(parts)
     assert recipe_of(ExactSearch())["class"] == "ExactSearch"
     assert recipe_of(LightGlueMatcher(np.ones(1), "network")) == {
