@@ -22,6 +22,7 @@ from mfvpr.matchers.host_matcher import PairSource
 from mfvpr.matchers.matcher import NEIGHBORS, LightGlueMatcher, Matcher
 from mfvpr.retrieval.retriever import Retriever, with_parts
 from mfvpr.utils.errors import InputError, require_word
+from mfvpr.utils.files import clip_middle
 
 _TYPICAL_MATCHES = 1000  # of a pair that no features limit
 _SAME_ASPECT = 0.02  # relative difference of two aspect ratios that count as the same
@@ -57,7 +58,8 @@ class Pipeline:
         number: Any = self.candidates
         is_whole = isinstance(number, int | np.integer) and not isinstance(number, bool)
         if not (number >= 1 if is_whole else isinstance(number, str) and number == "all"):
-            raise InputError(f"candidates={number!r}: expected a whole number from 1, or 'all'")
+            got = clip_middle(" ".join(repr(number).split()), 80)
+            raise InputError(f"candidates={got}: expected a whole number from 1, or 'all'")
         if not self.extractor.scales:
             name = type(self.extractor).__name__
             raise InputError(f"{name}: gives no local features; expected an extractor that does")
