@@ -19,7 +19,7 @@ from mfvpr.cli.schema import Evaluate, Paper
 from mfvpr.datasets import Dataset
 from mfvpr.evaluation import Pipeline, System, rank_dataset
 from mfvpr.features import PatchNetVladFeatures, SelaVprFeatures
-from mfvpr.features.windows import WindowExtractor
+from mfvpr.features.whitening import WindowExtractor
 from mfvpr.report.rendering import PAGE
 from mfvpr.report.run_files import ground_truth, write_run_folder
 from mfvpr.report.runs import LAST, write_json

@@ -1,6 +1,5 @@
 __all__ = [
     "Aggregated",
-    "Aggregation",
     "AlikedFeatures",
     "D2NetFeatures",
     "Description",
@@ -8,7 +7,6 @@ __all__ = [
     "Extractor",
     "FeatureSet",
     "FeatureSource",
-    "Fitting",
     "GlobalDescriptor",
     "InMemory",
     "MixVprDescriptor",
@@ -24,7 +22,7 @@ __all__ = [
     "WindowFitting",
 ]
 
-from .extractor import Aggregated, Aggregation, Description, Extractor, Fitting, Scale, Source
+from .extractor import Aggregated, Description, Extractor, Scale, Source
 from .feature_set import FeatureSet, FeatureSource, InMemory
 from .keypoint_networks import AlikedFeatures, D2NetFeatures
 from .network import GlobalDescriptor, MixVprDescriptor
@@ -32,4 +30,4 @@ from .patch_networks import Dinov2Features, PatchNetVladFeatures, SelaVprFeature
 from .sift import Sift
 from .ssm_features import SsmCells, SsmWindows
 from .vlad import Vlad, VladFitting
-from .windows import WindowFitting
+from .whitening import WindowFitting

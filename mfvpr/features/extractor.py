@@ -12,7 +12,8 @@ from jaxtyping import Float, Num
 from mfvpr.core.types import Features
 from mfvpr.datasets.datasets import ImageFolder
 from mfvpr.datasets.image_reading import Interpolation, resize
-from mfvpr.features.feature_set import FeatureSet, FeatureSource, check_features, without_padding
+from mfvpr.features.feature_set import FeatureSource, check_features, without_padding
+from mfvpr.features.vlad import VladFitting
 from mfvpr.utils.errors import InputError, require_word
 from mfvpr.utils.numerics import available_cpus
 from mfvpr.utils.runtime import Track, no_progress, ordered_map
@@ -89,21 +90,6 @@ class Extractor(Protocol):
         ...
 
 
-class Aggregation(Protocol):
-    """Local features -> a global descriptor of each image, of unit length and `vector_size` numbers."""
-
-    @property
-    def vector_size(self) -> int: ...
-
-    def __call__(self, images: Sequence[Features]) -> Float[np.ndarray, "images dimensions"]: ...
-
-
-class Fitting(Protocol):
-    """Settings of an aggregation that is learned from the database; equal features give equal aggregations."""
-
-    def fit(self, database: FeatureSet) -> Aggregation: ...
-
-
 @runtime_checkable
 class Source(Protocol):
     """Local features of folders of images that were extracted elsewhere, of one scale.
@@ -127,10 +113,10 @@ class Source(Protocol):
 
 @dataclass(frozen=True)
 class Aggregated:
-    """Global descriptors that are aggregated from local features, by an aggregation that is fitted to the database."""
+    """Global descriptors that are aggregated from local features, by a vocabulary that is fitted to the database."""
 
     extractor: Extractor | Source
-    fitting: Fitting
+    fitting: VladFitting
 
 
 def describe_folder(

@@ -3,17 +3,17 @@
 from collections.abc import Callable
 from dataclasses import KW_ONLY, dataclass, field
 from functools import cached_property
-from typing import Any, ClassVar, Protocol
+from typing import Any, ClassVar
 
 import jax
 import numpy as np
 from flax import nnx
-from jaxtyping import Float, Num
+from jaxtyping import Num
 
 from mfvpr.datasets.image_reading import Interpolation
 from mfvpr.features.extractor import Description, Scale
-from mfvpr.networks.layers import Images, Pixels, of_unit_length
-from mfvpr.networks.mixvpr import IMAGE_SIZE
+from mfvpr.networks.global_descriptors import IMAGE_SIZE
+from mfvpr.networks.layers import of_unit_length
 from mfvpr.utils.errors import InputError
 from mfvpr.utils.fields import SIZE, Rule, check_fields, setting, whole, word_of
 from mfvpr.utils.numerics import device_bytes, knows_own_context, repeat_last
@@ -107,28 +107,14 @@ class MixVprDescriptor(NetworkExtractor):
     )
 
 
-class DescriptorNetwork(Protocol):
-    """A network that maps preprocessed images to descriptors of unit length.
-
-    `has_components` says whether a descriptor consists of principal components, the largest first. `require` raises an
-    InputError if the network cannot take images of this (width, height) px.
-    """
-
-    dimension: int
-    has_components: bool
-
-    def require(self, size: tuple[int, int]) -> None: ...
-
-    def preprocess(self, images: Pixels) -> Images: ...
-
-    def __call__(self, images: Images) -> Float[jax.Array, "images dimensions"]: ...
-
-
 @dataclass(frozen=True)
 class GlobalDescriptor(NetworkExtractor):
-    """Global descriptors of a `DescriptorNetwork`, which takes images of many sizes, as the public code extracts them.
+    """Global descriptors of a network that takes images of many sizes, as the public code extracts them.
 
-    640 x 480 px is Patch-NetVLAD's size. Principal `components` that are kept are scaled to unit length again.
+    The model has `dimension`, `has_components` (whether a descriptor consists of principal components, the largest
+    first), `require(size)` (an InputError for sizes that it cannot take) and `preprocess(images)`; called with
+    preprocessed images, it returns descriptors of unit length. 640 x 480 px is Patch-NetVLAD's size. Principal
+    `components` that are kept are scaled to unit length again.
 
     Raises:
         InputError: the network cannot take images of this size, or has fewer principal components.
@@ -142,16 +128,15 @@ class GlobalDescriptor(NetworkExtractor):
     def __post_init__(self) -> None:
         super().__post_init__()
         self.model.require(self.image_size)
-        if self.components is not None and not self.model.has_components:
-            raise InputError(f"components={self.components}: expected None, since these weights have no whitening")
-        if self.components is not None and self.components > self.model.dimension:
-            raise InputError(f"components={self.components}: expected from 1 to {self.model.dimension}")
+        most = self.model.dimension if self.model.has_components else 0
+        if self.components is not None and self.components > most:
+            raise InputError(f"components={self.components}: expected null, or at most {most} of these weights")
 
     @property
     def vector_size(self) -> int:
         return self.components or self.model.dimension
 
-    def compute(self, model: DescriptorNetwork, images: jax.Array) -> jax.Array:
+    def compute(self, model: Any, images: jax.Array) -> jax.Array:
         descriptors = model(model.preprocess(images))
         return descriptors if self.components is None else of_unit_length(descriptors[:, : self.components])
 

@@ -15,9 +15,9 @@ from jaxtyping import Float
 from mfvpr.datasets.image_reading import Interpolation
 from mfvpr.features.extractor import Description, Scale, local_features
 from mfvpr.features.network import NetworkExtractor
+from mfvpr.networks.backbones import STRIDE
+from mfvpr.networks.global_descriptors import VggNetVlad
 from mfvpr.networks.layers import of_unit_length
-from mfvpr.networks.netvlad import VggNetVlad
-from mfvpr.networks.vgg import STRIDE
 from mfvpr.networks.vit import LOCAL, PATCH, SelaVpr, VisionTransformer, require_patches
 from mfvpr.utils.errors import InputError
 from mfvpr.utils.fields import POSITIVE, SIZE, list_of, number, setting, whole, word_of
@@ -73,14 +73,8 @@ class Dinov2Features(NetworkExtractor):
         width, height = self.image_size
         return (Scale(self.model.width, (width // PATCH) * (height // PATCH)),)
 
-    def compute(
-        self, model: VisionTransformer, images: jax.Array
-    ) -> tuple[
-        Float[jax.Array, "batch width"],
-        Float[jax.Array, "batch rows columns width"],
-        Float[jax.Array, "batch rows columns"],
-    ]:
-        """Global descriptors, local descriptors and scores."""
+    def compute(self, model: VisionTransformer, images: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
+        """Global descriptors `[B, D]`, local descriptors `[B, rows, columns, D]` and scores `[B, rows, columns]`."""
         tokens, output = model.with_block(model.preprocess(images), self.block)
         scores = output.attention / jnp.max(output.attention, axis=(1, 2), keepdims=True)
         return of_unit_length(tokens.class_token), of_unit_length(getattr(output, self.facet)), scores
@@ -132,8 +126,7 @@ class PatchNetVladFeatures(NetworkExtractor):
     Each of the `patch_sizes` is a scale; for `scale_weights` see `mfvpr.evaluation.fuse_scales`.
 
     Raises:
-        InputError: duplicate patch sizes, or a patch that is larger than the map; another number of weights than of
-            patch sizes.
+        InputError: a patch is larger than the map, or there are not as many weights as patch sizes.
     """
 
     network = VggNetVlad
@@ -156,8 +149,6 @@ class PatchNetVladFeatures(NetworkExtractor):
         if max(self.patch_sizes) > min(columns, rows):
             expected = f"sizes from 1 to {min(columns, rows)}, as a map of {columns} x {rows} positions has room for"
             raise InputError(f"patch_sizes={list(self.patch_sizes)}: expected {expected}")
-        if len(set(self.patch_sizes)) < len(self.patch_sizes):
-            raise InputError(f"patch_sizes={list(self.patch_sizes)}: expected each size once")
         if self.scale_weights is not None and len(self.scale_weights) != len(self.patch_sizes):
             expected = f"one for each of patch_sizes={list(self.patch_sizes)}, or None"
             raise InputError(f"scale_weights={list(self.scale_weights)}: expected {expected}")

@@ -8,15 +8,14 @@ from jaxtyping import UInt8
 
 from mfvpr.datasets.image_reading import Interpolation
 from mfvpr.features.extractor import Description, Scale, local_features
-from mfvpr.utils.fields import NOT_NEGATIVE, POSITIVE, SHAPED_SIZE, SIZE, check_fields, setting, whole, word_of
+from mfvpr.utils.fields import POSITIVE, SHAPED_SIZE, SIZE, check_fields, setting, whole, word_of
 
 
 @dataclass(frozen=True)
 class Sift:
     """RootSIFT of the gray image, 128 dimensions; scores are the detector's responses (of order 0.01 to 0.2).
 
-    The `max_keypoints` (None = all) of the highest scores are kept. `contrast_threshold` is OpenCV's, and `clahe_clip`
-    the clip limit of local histogram equalization before detection (0 = off).
+    The `max_keypoints` (None = all) of the highest scores are kept. `contrast_threshold` is OpenCV's.
     """
 
     vector_size = 0  # no global descriptor
@@ -24,7 +23,6 @@ class Sift:
     interpolation: Interpolation = setting("pil_bilinear", word_of(Interpolation))
     max_keypoints: int | None = setting(800, whole(1, 20_000) | None, "the highest scores are kept; null = all")
     contrast_threshold: float = setting(0.01, POSITIVE, "low: the strongest max_keypoints are kept, in dark images too")
-    clahe_clip: float = setting(0.0, NOT_NEGATIVE, "local histogram equalization before detection; 0 = off")
     batch_size: int = setting(8, whole(1, 256), recipe=False)
 
     __post_init__ = check_fields
@@ -39,8 +37,6 @@ class Sift:
         descriptions = []
         for image in images:
             gray = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)
-            if self.clahe_clip > 0:
-                gray = cv2.createCLAHE(self.clahe_clip, (8, 8)).apply(gray)
             detections, descriptors = detector.detectAndCompute(gray, None)
             scores = np.array([keypoint.response for keypoint in detections], np.float32)
             strongest = np.argsort(-scores, kind="stable")[: self.max_keypoints]  # OpenCV keeps ties beyond the limit

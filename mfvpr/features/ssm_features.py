@@ -1,20 +1,22 @@
 """SSM-VPR's descriptors (Camara & Preucil, RAS 2020): windows for retrieval, cells of a grid for matching."""
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any, ClassVar, Literal
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float, Num
 
+from mfvpr.core.types import Array
 from mfvpr.features.extractor import Description, Scale, local_features
 from mfvpr.features.network import NetworkExtractor, compile_network, only_size
-from mfvpr.features.whitening import Whitening
-from mfvpr.features.windows import WindowFitting, Windows, kernels, learned_whitening, normalize_maps, whiten_windows
-from mfvpr.networks.layers import Preprocessing
-from mfvpr.networks.vgg import STAGE1_STRIDE, STAGE2_STRIDE, SsmVgg
+from mfvpr.features.whitening import Whitening, WindowFitting, Windows, kernels, learned_whitening
+from mfvpr.networks.backbones import STAGE1_STRIDE, STAGE2_STRIDE, SsmVgg
+from mfvpr.networks.layers import PRECISION, Preprocessing
 from mfvpr.utils.fields import SIZE, setting, whole, word_of
 
 _CHANNELS = 512
@@ -23,14 +25,31 @@ _FITTINGS = {1: WindowFitting(125), 2: WindowFitting(100, dtype="float64")}  # a
 _MIDDLE = (STAGE2_STRIDE - 1) / 2  # px from a position's first pixel to its middle
 
 
+def normalize_maps(maps: Float[Array, "*batch channels"]) -> Float[Array, "*batch channels"]:
+    """Scale maps to unit length at every position; zero stays zero."""
+    length = jnp.sqrt(jnp.sum(maps * maps, axis=-1, keepdims=True))
+    return maps / jnp.where(length > 0, length, 1.0)
+
+
+def whiten_windows(
+    maps: Float[Array, "images rows columns channels"],
+    kernel: Float[Array, "size size channels dimensions"],
+    offset: Float[Array, " dimensions"],
+    *,
+    stride: int,
+) -> Float[Array, "images windows dimensions"]:
+    """Descriptors of all windows of maps."""
+    axes = ("NHWC", "HWIO", "NHWC")
+    strides = (stride, stride)
+    descriptors = jax.lax.conv_general_dilated(
+        maps, kernel, strides, "VALID", dimension_numbers=axes, precision=PRECISION
+    )
+    return descriptors.reshape(len(maps), -1, descriptors.shape[-1]) - offset[None, None]
+
+
 @dataclass(frozen=True)
 class SsmMaps(NetworkExtractor):
-    """Feature maps of one stage as global descriptors, of unit length at every position.
-
-    Attributes, beside those of `NetworkExtractor`:
-        preprocessing: "torch" as the public code, or "caffe", which the weights are for.
-        stage: 1 or 2.
-    """
+    """Feature maps of `stage` 1 or 2 as global descriptors, of unit length at every position."""
 
     preprocessing: Preprocessing = "torch"
     stage: Literal[1, 2] = 1
@@ -43,18 +62,21 @@ class SsmMaps(NetworkExtractor):
 
     @property
     def vector_size(self) -> int:
-        return int(np.prod(self.shape))
+        return math.prod(self.shape)
 
     def compute(
-        self, model: SsmVgg, images: Num[jax.Array, "images height width 3"]
-    ) -> Float[jax.Array, "images rows columns 512"]:
+        self, model: SsmVgg, images: Num[Array, "images height width 3"]
+    ) -> Float[Array, "images rows columns 512"]:
         """Maps of a batch; runs in a compiled program."""
         return normalize_maps(model(model.preprocess(images, self.preprocessing), self.stage))
 
 
 @dataclass(frozen=True)
 class _WhitenedWindows(NetworkExtractor):
-    """Base of the extractors of whitened windows of a stage's maps."""
+    """Base of the extractors of whitened windows of a stage's maps.
+
+    `whitening` are settings to learn it from the database, or the learned whitening.
+    """
 
     stage: ClassVar[Literal[1, 2]]
 
@@ -71,14 +93,8 @@ class _WhitenedWindows(NetworkExtractor):
     @property
     def maps(self) -> SsmMaps:
         """Extractor of the stage's maps."""
-        return SsmMaps(
-            self.model,
-            self.image_size,
-            interpolation=self.interpolation,
-            batch_size=self.batch_size,
-            preprocessing=self.preprocessing,
-            stage=self.stage,
-        )
+        names = ("interpolation", "batch_size", "preprocessing", "stage")
+        return SsmMaps(self.model, self.image_size, **{name: getattr(self, name) for name in names})
 
     @cached_property
     def _program(self) -> Callable[..., Any]:
@@ -86,7 +102,7 @@ class _WhitenedWindows(NetworkExtractor):
         maps, windows = self.maps, self.windows
         convolution = jax.device_put(kernels(learned_whitening(self), windows))
 
-        def describe(model: SsmVgg, images: jax.Array, kernel: jax.Array, offset: jax.Array) -> jax.Array:
+        def describe(model: SsmVgg, images: Array, kernel: Array, offset: Array) -> Array:
             return whiten_windows(maps.compute(model, images), kernel, offset, stride=windows.stride)
 
         program = compile_network(self.model, describe)
@@ -98,7 +114,6 @@ class SsmWindows(_WhitenedWindows):
     """Descriptors for retrieval by votes: 36 whitened windows of 9 x 9 positions of the first stage's map.
 
     Images have 224 x 224 px, because the map of a larger image has more windows and the public code draws 36.
-    `whitening` are settings to learn it from the database, or the learned whitening.
     """
 
     stage = 1
@@ -123,13 +138,8 @@ class SsmCells(_WhitenedWindows):
     Descriptors are of any length. Match each cell of the candidate to the cell of the largest dot product
     (`cross_check="candidate"` of `mfvpr.match`), and score with `GridAnchors`, `side` as in `windows.grid`.
 
-    Attributes, beside those of `SsmMaps`:
-        image_size: (width, height) px: 336 x 336 as the paper, 224 x 224 as the public program, 448 x 448.
-        whitening: settings to learn it from the database, or the learned whitening.
-        stride: positions from cell to cell.
-
-    Raises:
-        InputError: images of this size have no cells.
+    `image_size` is 336 x 336 px in the paper, 224 x 224 in the public program, or 448 x 448. `stride` is the number of
+    positions from cell to cell. Images without cells raise an `InputError`.
     """
 
     has_vector, stage = False, 2

@@ -1,14 +1,23 @@
-"""Principal components of unit variance, from the covariance or the Gram matrix, whichever is smaller."""
+"""Principal components of unit variance, of descriptors and of windows of a network's maps.
 
-from collections.abc import Iterator
+Whitened windows are the descriptors of both stages of SSM-VPR (Camara & Preucil, RAS 2020). The whitening is learned
+from windows of the database's images, see `mfvpr.retrieval.fit_to_database`. It is linear: descriptors of all windows
+are one convolution of the map, and only the fitting forms windows.
+"""
+
+from collections.abc import Iterable, Iterator, Mapping
 from contextlib import suppress
 from dataclasses import dataclass
+from typing import Literal, Protocol, runtime_checkable
 
 import numpy as np
 import scipy  # its subpackages are imported at their first use
-from jaxtyping import Float
+from jaxtyping import Float, Int
 
+from mfvpr.features.extractor import Extractor
 from mfvpr.utils.errors import InputError
+from mfvpr.utils.fields import COUNT, FLAG, INDEX, check_fields, setting, whole
+from mfvpr.utils.fingerprints import fingerprint, recipe_of
 
 FEW = 10  # Lanczos' method is used if there are this many times more dimensions than components
 SMALLEST = 1e-6  # of the largest standard deviation; smaller ones are rounding errors
@@ -33,7 +42,8 @@ def fit_whitening(sample: Float[np.ndarray, "vectors dimensions"], dimension: in
     """Fit a whitening to a finite sample, float32 or float64, in double precision; its arrays have the sample's type.
 
     As PCA(whiten=True, svd_solver="full") of scikit-learn, with signs that make the entry of the largest magnitude of
-    each component (the first of several) positive. Too few or equal vectors raise an `InputError`.
+    each component (the first of several) positive. The covariance or the Gram matrix is solved, whichever is smaller.
+    Too few or equal vectors raise an `InputError`.
     """
     count, size = sample.shape
     if not 1 <= dimension < count or dimension > size:
@@ -78,3 +88,135 @@ def _center_blocks(sample: np.ndarray, mean: np.ndarray, *, by_rows: bool) -> It
     for start in range(0, count if by_rows else size, step):
         part = slice(start, start + step)
         yield sample[part] - mean if by_rows else sample[:, part] - mean[part]
+
+
+@dataclass(frozen=True)
+class Windows:
+    """Positions of the windows of a map, in row order."""
+
+    shape: tuple[int, int, int]  # (rows, columns, channels) of the map
+    size: int  # positions per side of a window
+    stride: int = 1  # positions from window to window
+
+    def __post_init__(self) -> None:
+        if min(self.shape[:2]) < self.size:
+            got = f"{self.shape[0]} x {self.shape[1]}; take larger images"
+            raise InputError(f"windows of {self.size} x {self.size}: expected a map of as many positions, got {got}")
+
+    @property
+    def grid(self) -> tuple[int, int]:
+        """(rows, columns) of windows."""
+        rows, columns = ((side - self.size) // self.stride + 1 for side in self.shape[:2])
+        return rows, columns
+
+    @property
+    def count(self) -> int:
+        """Number of windows of a map."""
+        return self.grid[0] * self.grid[1]
+
+    @property
+    def dimension(self) -> int:
+        """Length of a window as a vector, (row, column, channel)."""
+        return self.size**2 * self.shape[2]
+
+    @property
+    def corners(self) -> Int[np.ndarray, "windows 2"]:
+        """(row, column) of each window's first position."""
+        return self.stride * np.stack(np.divmod(np.arange(self.count), self.grid[1]), axis=1)
+
+    def take(
+        self, image_map: Float[np.ndarray, "rows columns channels"], numbers: Int[np.ndarray, " windows"]
+    ) -> Float[np.ndarray, "windows dimensions"]:
+        """The windows `numbers` of one map."""
+        parts = [image_map[row : row + self.size, column : column + self.size] for row, column in self.corners[numbers]]
+        return np.reshape(parts, (len(numbers), self.dimension))
+
+
+@dataclass(frozen=True)
+class WindowFitting:
+    """Settings of a whitening that is learned from random windows of random images of the database.
+
+    `dimension` is D' of the whitened vectors, `dtype` that of the windows and of the result (sums are always in double
+    precision). The public code has no seed; its second stage has a `zero_row`, a window of zeros.
+    """
+
+    dimension: int = setting(100, whole(1, 4096), "that are learned from the database and kept")
+    max_images: int | None = setting(250, COUNT | None, "of the database to learn from; null = all")
+    max_windows: int | None = setting(10_000, COUNT | None, "of these images; null = all")
+    zero_row: bool = setting(False, FLAG, "learn from a row of zeros as well, as the public code may")
+    dtype: Literal["float32", "float64"] = "float32"
+    seed: int = setting(0, INDEX)
+
+    __post_init__ = check_fields
+
+    def sample_rows(self, num_images: int) -> list[int]:
+        """Rows of the images to learn from."""
+        rows = np.random.default_rng([self.seed, 0]).permutation(num_images)
+        return sorted(rows[: self.max_images].tolist())
+
+    def fit(
+        self,
+        maps: Iterable[Mapping[int, Float[np.ndarray, "rows columns channels"]]],
+        windows: Windows,
+        rows: list[int],
+    ) -> Whitening:
+        """Learn the whitening from maps of the images in `rows` (`sample_rows`), which come by row in batches.
+
+        Unreadable images may be missing. Too few windows raise an `InputError`.
+        """
+        total = len(rows) * windows.count
+        chosen = np.arange(total)
+        if self.max_windows is not None and total > self.max_windows:
+            rng = np.random.default_rng([self.seed, 1])
+            chosen = np.sort(rng.choice(total, self.max_windows, replace=False))
+        count = len(chosen) + self.zero_row
+        sample, filled = np.zeros((count, windows.dimension), self.dtype), 0
+        starts = {row: windows.count * number for number, row in enumerate(rows)}
+        for batch in maps:
+            for row, image_map in batch.items():
+                first, end = np.searchsorted(chosen, [starts[row], starts[row] + windows.count])
+                sample[filled : filled + end - first] = windows.take(image_map, chosen[first:end] - starts[row])
+                filled += end - first
+        return fit_whitening(sample[: filled + self.zero_row], self.dimension)
+
+
+@runtime_checkable
+class WindowExtractor(Protocol):
+    """An extractor of whitened windows of `maps`: a dataclass whose `whitening` is replaced when it was learned."""
+
+    @property
+    def whitening(self) -> WindowFitting | Whitening: ...
+
+    @property
+    def windows(self) -> Windows: ...
+
+    @property
+    def maps(self) -> Extractor: ...
+
+
+def learned_whitening(extractor: WindowExtractor) -> Whitening:
+    """The extractor's learned whitening; an `InputError` if it was not learned yet, or from something else."""
+    name, whitening, expected = type(extractor).__name__, extractor.whitening, extractor.windows.dimension
+    if not isinstance(whitening, Whitening):
+        raise InputError(f"{name}: has not seen the database; take mfvpr.retrieval.fit_to_database(...) of it")
+    if len(whitening.mean) != expected or whitening.origin not in ("", origin(extractor)):
+        got = f"one of {len(whitening.mean)} that was learned with others; replace it by a WindowFitting"
+        same = f"{expected} numbers that was learned with the same network, images and windows"
+        raise InputError(f"{name}: expected a whitening of {same}, got {got}")
+    return whitening
+
+
+def origin(extractor: WindowExtractor) -> str:
+    """Hash of the network, its preprocessing and the windows; "" if they have no recipe."""
+    with suppress(TypeError):
+        return fingerprint(recipe_of([extractor.maps, extractor.windows]))
+    return ""
+
+
+def kernels(
+    whitening: Whitening, windows: Windows
+) -> tuple[Float[np.ndarray, "size size channels dimensions"], Float[np.ndarray, " dimensions"]]:
+    """The whitening as a convolution of a map: a kernel and an offset, float32."""
+    components = whitening.components.reshape(-1, windows.size, windows.size, windows.shape[2])
+    offset = whitening.components.astype(np.float64) @ whitening.mean
+    return np.moveaxis(components, 0, -1).astype(np.float32), offset.astype(np.float32)

@@ -21,7 +21,7 @@ from mfvpr.core.types import Features
 from mfvpr.datasets.datasets import ImageFolder
 from mfvpr.datasets.image_reading import read_image, resize
 from mfvpr.evaluation.system import Note, System
-from mfvpr.features.extractor import Aggregation, Description, Extractor, describe_images
+from mfvpr.features.extractor import Description, Extractor, describe_images
 from mfvpr.features.feature_set import SHARE, check_features
 from mfvpr.features.vlad import Vlad, VladFitting
 from mfvpr.matchers.host_matcher import PairSource
@@ -140,7 +140,7 @@ class Describing:
     """Extractors of a map; the features of queries are rounded as a store rounds the features of the map."""
 
     extractor: Extractor  # of local features of one scale
-    describer: Extractor | Aggregation  # of global descriptors; may be the same extractor
+    describer: Extractor | Vlad  # of global descriptors; may be the same extractor
 
     def image(self, image: Image) -> Described:
         """Describe one image: a file, or `[H, W, 3]` uint8 RGB in any form that `np.asarray` converts."""

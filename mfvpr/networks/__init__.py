@@ -2,7 +2,7 @@
 
 Images are `[B, H, W, 3]` float32. Products have full float32 precision: with less, keypoints move.
 
-Read first: d2net or mixvpr, then the shared parts: vgg, resnet, vit, layers.
+Read first: d2net or global_descriptors, then the shared parts: backbones, vit, layers.
 """
 
 import lazy_loader

@@ -14,10 +14,8 @@ __all__ = [
 ]
 
 from .aliked import Aliked
+from .backbones import ResNet50, SsmVgg, Vgg16
 from .d2net import D2Net
+from .global_descriptors import Gem, MixVPR, NetVlad, VggNetVlad
 from .lightglue import LightGlue
-from .mixvpr import MixVPR
-from .netvlad import Gem, NetVlad, VggNetVlad
-from .resnet import ResNet50
-from .vgg import SsmVgg, Vgg16
 from .vit import SelaVpr, VisionTransformer

@@ -17,7 +17,6 @@ from jaxtyping import Bool, Float, Int
 from mfvpr.core.types import Array
 from mfvpr.networks.layers import EPSILON, PRECISION, BatchNorm, Images, bias_of, conv, matmul, of_unit_length
 from mfvpr.networks.sampling import Neighbors, around, between, neighbors, sample, stretch
-from mfvpr.utils.errors import InputError
 
 STRIDE = 32  # px, of the coarsest map
 RADIUS = 2  # px, of the suppression, the refinement and the border without keypoints
@@ -78,16 +77,10 @@ class Block(nnx.Module):
 class Aliked(nnx.Module):
     """ALIKED's network. The detector has no weights and is not part of it.
 
-    Args:
-        variant: "aliked-t16", "aliked-n16", "aliked-n16rot" or "aliked-n32".
-
-    Raises:
-        InputError: there is no such variant.
+    `variant` is "aliked-t16", "aliked-n16", "aliked-n16rot" or "aliked-n32".
     """
 
     def __init__(self, variant: str = "aliked-n16", *, rngs: nnx.Rngs) -> None:
-        if variant not in VARIANTS:
-            raise InputError(f"ALIKED: expected one of {', '.join(VARIANTS)}, got {variant}")
         widths, self.dimension, positions = VARIANTS[variant]
         inputs = 3
         for place, width in enumerate(widths, start=1):
@@ -98,20 +91,10 @@ class Aliked(nnx.Module):
         self.score_head = nnx.List([conv(*step, rngs=rngs) for step in steps])
         self.desc_head = DescriptorHead(self.dimension, positions, rngs=rngs)
 
-    def __call__(
-        self, images: Images
-    ) -> tuple[Float[Array, "batch height width dimensions"], Float[Array, "batch height width"]]:
-        """Features of unit length and scores in (0, 1) of all pixels of RGB images, 0 .. 1.
-
-        Border pixels are repeated to make the sides multiples of 32.
-        """
-        levels, scores = self.levels(images)
-        return jax.vmap(lambda levels: field(levels, *_inside(images)).dense())(levels), scores
-
     def extract(
         self, images: Images, threshold: Array | float, capacity: int
     ) -> tuple["Detections", Float[Array, "batch slots dimensions"]]:
-        """Keypoints of images, and their descriptors of unit length."""
+        """Keypoints of RGB images, 0 .. 1, and their descriptors of unit length."""
         levels, scores = self.levels(images)
 
         def extract_one(levels: list[Array], scores: Array) -> tuple[Detections, Array]:
@@ -123,7 +106,10 @@ class Aliked(nnx.Module):
     def levels(
         self, images: Images
     ) -> tuple[list[Float[Array, "batch _ _ channels"]], Float[Array, "batch height width"]]:
-        """Parts of the features at each resolution of the padded images, and scores."""
+        """Parts of the features at each resolution of the padded images, and scores in (0, 1) of all pixels.
+
+        Border pixels are repeated to make the sides multiples of 32.
+        """
         rows, columns = _inside(images)
         height, width = (-(-size // STRIDE) * STRIDE for size in images.shape[1:3])
         margins = (rows.start, height - rows.stop), (columns.start, width - columns.stop)
@@ -220,10 +206,6 @@ class Field(NamedTuple):
                 parts.append((weight * (1 - part))[:, None] * before + (weight * part)[:, None] * after)
         return parts
 
-    def dense(self) -> Float[Array, "height width dimensions"]:
-        """All features."""
-        return jnp.concatenate(_enlarge(self.levels), axis=-1) * self.inverse_norm[..., None]
-
 
 def field(levels: Sequence[Float[Array, "_ _ channels"]], rows: slice, columns: slice) -> Field:
     """Field of levels, the first of full size, cropped to `rows` and `columns`."""
@@ -232,12 +214,9 @@ def field(levels: Sequence[Float[Array, "_ _ channels"]], rows: slice, columns: 
     for level in levels[1:]:
         down, right = neighbors(level.shape[0], height, rows), neighbors(level.shape[1], width, columns)
         parts.append(Level(between(level, down, -3), right))
-    squares = [jnp.sum(part * part, axis=-1) for part in _enlarge(parts)]
+    wide = [part.rows if part.columns is None else between(part.rows, part.columns, -2) for part in parts]
+    squares = [jnp.sum(part * part, axis=-1) for part in wide]
     return Field(tuple(parts), 1 / jnp.maximum(jnp.sqrt(sum(squares[1:], start=squares[0])), EPSILON))
-
-
-def _enlarge(levels: Sequence[Level]) -> list[Array]:
-    return [rows if columns is None else between(rows, columns, -2) for rows, columns in levels]
 
 
 def _rows_at(rows: Array, places: Array) -> Array:

@@ -138,33 +138,33 @@ class VisionTransformer(nnx.Module):
 
     def __call__(self, images: Images) -> Tokens:
         """Normalized tokens of preprocessed images."""
-        x = self._embed(images)
-        for block in self.blocks:
-            x = block(x)
-        x = self.norm(x)
-        return Tokens(x[:, 0], _maps(x, images))
+        return self._tokens(self._states(images)[-1], images)
 
     def with_block(self, images: Images, index: int) -> tuple[Tokens, BlockOutput]:
         """Normalized tokens of preprocessed images, and the output of the block with this index."""
-        states = [self._embed(images)]
-        for block in self.blocks:
-            states.append(block(states[-1]))
-        x = self.norm(states[-1])
+        states = self._states(images)
         place, block = index % len(self.blocks), self.blocks[index]
         parts = block.attention.split(block.norm1(states[place]))
         joined = jnp.moveaxis(parts, 2, 3).reshape(3, *states[place].shape)
         of_class = parts[0, :, :, :1] * parts.shape[-1] ** -0.5  # query of the class token, the first
         attention = jax.nn.softmax(matmul(of_class, parts[1].swapaxes(2, 3))[:, :, 0], axis=-1)
         values = (self.norm(states[place + 1]), *joined, jnp.mean(attention, axis=1))
-        return Tokens(x[:, 0], _maps(x, images)), BlockOutput(*(_maps(each, images) for each in values))
+        return self._tokens(states[-1], images), BlockOutput(*(_maps(each, images) for each in values))
 
-    def _embed(self, images: Images) -> Float[Array, "batch tokens dimensions"]:
-        """Class token, registers and patches with their positions, the input of the first block."""
+    def _states(self, images: Images) -> list[Float[Array, "batch tokens dimensions"]]:
+        """Inputs of the blocks, and the output of the last; the first has class token, registers and patches."""
         positions = _resize_positions(self.positions[...][1:], images.shape[1] // PATCH, images.shape[2] // PATCH)
         first = (self.first[...] + self.positions[...][0])[None]
         extra = jnp.concatenate([first, self.registers[...]]) if self.has_registers else first
         extra = jnp.broadcast_to(extra, (len(images), *extra.shape))
-        return jnp.concatenate([extra, self.patches(images) + positions[None]], axis=1)
+        states = [jnp.concatenate([extra, self.patches(images) + positions[None]], axis=1)]
+        for block in self.blocks:
+            states.append(block(states[-1]))
+        return states
+
+    def _tokens(self, state: Float[Array, "batch tokens dimensions"], images: Images) -> Tokens:
+        normalized = self.norm(state)
+        return Tokens(normalized[:, 0], _maps(normalized, images))
 
 
 def _maps(

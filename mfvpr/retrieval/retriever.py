@@ -11,8 +11,7 @@ from mfvpr.core.types import Shortlist
 from mfvpr.datasets.datasets import ImageFolder, QuerySequence
 from mfvpr.datasets.positives import Positives
 from mfvpr.features.extractor import Aggregated, Extractor, describe_folder
-from mfvpr.features.whitening import Whitening
-from mfvpr.features.windows import WindowExtractor, WindowFitting, origin
+from mfvpr.features.whitening import Whitening, WindowExtractor, WindowFitting, origin
 from mfvpr.retrieval.search import EXACT, Search
 from mfvpr.storage.cache_files import CacheFiles
 from mfvpr.storage.feature_cache import FeatureCache

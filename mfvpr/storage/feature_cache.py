@@ -24,8 +24,9 @@ from jaxtyping import Float, Int
 from mfvpr.core.types import Features
 from mfvpr.datasets.contents import Contents, contents, files_of, state_of
 from mfvpr.datasets.datasets import ImageFolder
-from mfvpr.features.extractor import Aggregated, Aggregation, Description, Extractor, Source, describe_folder
+from mfvpr.features.extractor import Aggregated, Description, Extractor, Source, describe_folder
 from mfvpr.features.feature_set import FeatureSet
+from mfvpr.features.vlad import Vlad
 from mfvpr.storage.cache_files import THREADS, CacheFiles, pack_features, unpack_features
 from mfvpr.utils.errors import InputError
 from mfvpr.utils.fingerprints import fingerprint, recipe_of, versions
@@ -330,7 +331,7 @@ class FeatureCache:
     def _aggregate(self, folder: ImageFolder, describer: Aggregated, database: ImageFolder, label: str) -> Vectors:
         [features] = self.local(folder, describer.extractor, label=label)
 
-        def fit() -> Aggregation:
+        def fit() -> Vlad:
             return describer.fitting.fit(*self.local(database, describer.extractor, label="database"))
 
         aggregation = self.once("aggregation", fit, database, describer)

@@ -23,7 +23,7 @@ from mfvpr.datasets import Dataset
 from mfvpr.evaluation import DriveFilter, FrameCorrelation, Fusion, Pipeline, System
 from mfvpr.evaluation.rankings import RetrievalScore, Ties
 from mfvpr.features import Aggregated, Extractor, Sift, VladFitting
-from mfvpr.features.windows import WindowFitting
+from mfvpr.features.whitening import WindowFitting
 from mfvpr.io.features import Lengths
 from mfvpr.matchers import LightGlueMatcher, Matcher, NearestNeighborMatcher
 from mfvpr.retrieval import (

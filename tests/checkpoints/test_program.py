@@ -174,20 +174,16 @@ def test_verify_tells_each_bad_file(program, folder, arrays, tmp_path):
 
 
 class Site(BaseHTTPRequestHandler):
-    """Serves one file, a longer one, a shorter one, and one that never ends."""
+    """Serves one file, one of other content, and a shorter one."""
 
     def do_GET(self):
-        if self.path not in ("/good", "/long", "/short", "/slow"):
+        if self.path not in ("/good", "/long", "/short"):
             return self.send_error(404)
         self.send_response(200)
         self.send_header("Content-Length", str(len(CONTENT)))
         self.end_headers()
         if self.path == "/long":
             self.wfile.write(CONTENT[:-4] + b"else")
-        elif self.path == "/slow":
-            self.wfile.write(CONTENT[: 1 << 19])
-            self.wfile.flush()
-            threading.Event().wait(20)
         else:
             self.wfile.write(CONTENT if self.path == "/good" else CONTENT[: 1 << 18])
 

@@ -71,17 +71,6 @@ def test_own_features_lose_their_padding_and_nothing_else():
     assert feature_set.keypoint_bytes == KEYPOINT
 
 
-def test_own_features_of_any_type_are_matched_in_single_precision():
-    [image] = images_of([5])
-    keypoints = np.round(image.keypoints).astype(int)
-    integers = replace(image, keypoints=keypoints, descriptors=image.descriptors.astype(np.float64))
-    feature_set = FeatureSet.of([integers, image])
-    for row in range(2):
-        dtypes = {part.name: getattr(feature_set[row], part.name).dtype for part in fields(Features)}
-        assert set(dtypes.values()) == {np.dtype(np.float32), np.dtype(bool)}
-    assert_are(on_device(Slots(feature_set, np.arange(2), 10**6, DEVICE), [1]), [integers, image], [1])
-
-
 AXES = {"keypoints": (2, 5, 2), "descriptors": (2, 5, 16), "scores": (2, 5), "mask": (2, 5), "image_size": (2, 2)}
 STACKED = {name: np.ones(shape, bool if name == "mask" else float) for name, shape in AXES.items()}
 

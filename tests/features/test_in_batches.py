@@ -7,8 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from mfvpr.features import Sift, network
-from mfvpr.utils import InputError
+from mfvpr.features import network
 
 IMAGES = np.random.default_rng(0).integers(0, 256, (7, 6, 5, 3), np.uint8)
 
@@ -65,8 +64,3 @@ def test_an_error_of_the_network_is_not_lost(bad, count, error):
 def test_settings_of_the_caller_hold_for_all_images(program):
     with jax.enable_x64(True):
         assert [total.dtype for total, _ in network.in_batches(program, IMAGES, 8)] == [np.float64] * 7
-
-
-def test_a_batch_has_images():
-    with pytest.raises(InputError, match="batch_size=0: expected a whole number from 1"):
-        Sift(image_size=(160, 120), batch_size=0)

@@ -13,11 +13,9 @@ from mfvpr import datasets
 from mfvpr.baselines import GridAnchors
 from mfvpr.datasets import ImageFolder
 from mfvpr.evaluation import match_sequence
-from mfvpr.evaluation.sequence_matching import matches_recipe
 from mfvpr.features import Aggregated, Sift, SsmCells, SsmWindows, VladFitting, WindowFitting
-from mfvpr.features.ssm_features import SsmMaps
-from mfvpr.features.whitening import Whitening, fit_whitening
-from mfvpr.features.windows import Windows, kernels, whiten_windows
+from mfvpr.features.ssm_features import SsmMaps, whiten_windows
+from mfvpr.features.whitening import Whitening, Windows, fit_whitening, kernels
 from mfvpr.matchers import NearestNeighborMatcher
 from mfvpr.retrieval import Retrieval, SsmVoting, fit_to_database
 from mfvpr.retrieval.retriever import whitening_recipe
@@ -252,22 +250,6 @@ def test_the_database_is_looked_at_once_for_all_sequences(cells, small_street, d
     assert second.matches[0].counts.shape == (10, 3)
     with pytest.raises(InputError, match=r"^grid: .*NaN"):  # of 4 x 3 cells
         evaluate_parts(several, cells, RETRIEVAL, {"grid": GridAnchors(3)}, **options)
-
-
-@pytest.mark.slow
-def test_an_image_is_found_by_itself_with_every_cell(model, dataset, tmp_path):
-    """4 x 4 cells, each of which is nearest to itself, so that each agrees with all others."""
-    square = SsmCells(model, SMALL[:1] * 2, whitening=WindowFitting(15))
-    self_dataset = replace(dataset, sequences=(replace(dataset.only, images=dataset.database),))
-    options = {"matcher": CANDIDATE, "cache": FeatureCache(tmp_path)}
-    report = evaluate_parts(self_dataset, square, RETRIEVAL, {"grid": GridAnchors(4, 3)}, candidates=4, **options)
-    [ranked] = report.systems["grid"]
-    np.testing.assert_array_equal(ranked.rows[:, 0], np.arange(10))
-    np.testing.assert_array_equal(ranked.scores[:, 0], np.full(10, (2 + 3 + 3 + 2) ** 2))
-    pipeline = mfvpr.Pipeline(square, RETRIEVAL, CANDIDATE, 4)
-    recipes = [matches_recipe(self_dataset, self_dataset.only, pipeline, FeatureCache(tmp_path))]
-    recipes.append(recipes[0] | {"database": FeatureCache().recipes.of_folder(self_dataset.database, square)})
-    assert recipes[0] != recipes[1]
 
 
 @pytest.mark.slow

@@ -10,8 +10,8 @@ from mfvpr.datasets import resize
 from mfvpr.evaluation import FrameCorrelation
 from mfvpr.features import WindowFitting
 from mfvpr.features.extractor import local_features
-from mfvpr.features.ssm_features import SsmMaps
-from mfvpr.features.windows import Windows, kernels, normalize_maps, whiten_windows
+from mfvpr.features.ssm_features import SsmMaps, normalize_maps, whiten_windows
+from mfvpr.features.whitening import Windows, kernels
 from mfvpr.retrieval.retriever import vote
 from tests.baselines.test_grid_anchors import cells
 from tests.golden import make_ssm

@@ -1,7 +1,7 @@
 """Makes aliked.npz: what the public code finds. `python -m tests.golden aliked CLONE WEIGHTS IMAGES`
 
 CLONE is a clone of https://github.com/Shiaoming/ALIKED, WEIGHTS the folder of its files, IMAGES that of grief_season.
-What the public code uses of torchvision and of its own compiled operator is written out here.
+It needs torchvision; its own compiled operator is written out here.
 """
 
 import sys
@@ -57,27 +57,6 @@ def picture(case: Case, images: Path) -> np.ndarray:
     return resize(read_image(images / case.image), (case.width, case.height))
 
 
-def _deformable(input, offset, weight, bias=None, padding=None, mask=None):
-    """torchvision's `deform_conv2d`, 3 x 3 with stride 1 and one pixel of padding."""
-    import torch
-
-    batch, channels, height, width = input.shape
-    offset = offset.unflatten(1, (9, 2))
-    tap = torch.arange(9).view(1, 9, 1, 1)
-    y = torch.arange(height).view(1, 1, -1, 1) + tap // 3 - 1 + offset[:, :, 0]
-    x = torch.arange(width).view(1, 1, 1, -1) + tap % 3 - 1 + offset[:, :, 1]
-    sampled = torch.zeros(batch, channels, 9 * height * width)
-    for row in (y.floor(), y.floor() + 1):
-        for column in (x.floor(), x.floor() + 1):
-            inside = (row >= 0) & (row < height) & (column >= 0) & (column < width)
-            share = (1 - (y - row).abs()) * (1 - (x - column).abs()) * inside
-            place = row.clamp(0, height - 1) * width + column.clamp(0, width - 1)
-            place = place.long().flatten(1)[:, None].expand(-1, channels, -1)
-            sampled += input.flatten(2).gather(2, place) * share.flatten(1)[:, None]
-    taps = sampled.unflatten(2, (9, -1)).flatten(1, 2)
-    return (weight.flatten(1) @ taps).unflatten(2, (height, width))
-
-
 class _Patches:
     """The compiled operator: neighborhoods of pixels, zeros outside."""
 
@@ -92,29 +71,13 @@ class _Patches:
         return padded[:, rows[:, :, None], columns[:, None]].transpose(0, 1)
 
 
-def _stubs() -> None:
-    """Makes importable what the public code imports."""
-    import torch
-    from torch import nn
-
-    def conv(inputs: int, outputs: int, size: int) -> nn.Module:
-        return nn.Conv2d(inputs, outputs, size, padding=size // 2, bias=False)
-
-    convs = {"conv1x1": lambda *widths: conv(*widths, 1), "conv3x3": lambda *widths: conv(*widths, 3)}
-    models = replace_module("torchvision.models", resnet=replace_module("torchvision.models.resnet", **convs))
-    operators = replace_module("torchvision.ops", deform_conv2d=_deformable)
-    replace_module("torchvision", ops=operators, models=models)
-    to_tensor = lambda image: torch.from_numpy(image.copy()).permute(2, 0, 1) / 255  # noqa: E731
-    replace_module("torchvision.transforms", ToTensor=lambda: to_tensor)
-    replace_module("custom_ops", get_patches=_Patches)
-    torch.cuda.synchronize = lambda *_: None
-
-
 def main(clone: str, weights: str, images: str) -> dict[str, np.ndarray]:
     sys.path.insert(0, clone)
-    _stubs()
+    replace_module("custom_ops", get_patches=_Patches)
     import torch
     from nets.aliked import ALIKED
+
+    torch.cuda.synchronize = lambda *_: None
 
     golden = {}
     for case in (*REAL, DRAWN):

@@ -1,14 +1,14 @@
 """Makes netvlad.npz: global descriptors and patches of public codes with random weights, in float64.
 
-`python -m tests.golden netvlad PATCHNETVLAD HLOC COSPLACE TORCHVISION` with clones of
+`python -m tests.golden netvlad PATCHNETVLAD HLOC COSPLACE` with torchvision and clones of
 https://github.com/QVPR/Patch-NetVLAD, https://github.com/cvg/Hierarchical-Localization and
-https://github.com/gmberton/CosPlace, and a folder that holds torchvision's package, of which Python's files are enough.
+https://github.com/gmberton/CosPlace.
 """
 
 import importlib
 import sys
 import tempfile
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -45,28 +45,19 @@ def name(*case: Any) -> str:
     return "/".join(map(str, case))
 
 
-def main(patch_netvlad: str, hloc: str, cosplace: str, torchvision: str) -> dict[str, np.ndarray]:
+def main(patch_netvlad: str, hloc: str, cosplace: str) -> dict[str, np.ndarray]:
     import torch
+    from torchvision import models
 
-    _torchvision(torchvision)
+    for name_of_network in ("vgg16", "resnet50"):  # without their training
+        maker = getattr(models, name_of_network)
+        setattr(models, name_of_network, lambda maker=maker, **_: maker())
     replace_module("sklearn", neighbors=replace_module("sklearn.neighbors", NearestNeighbors=None))  # for training
     with torch.inference_mode():
         golden = dict(_patches(patch_netvlad)) | dict(_positions())
         golden[name("matlab", *MATLAB)] = _matlab(hloc)
         golden |= {name("gem", *case): _gem(cosplace, *case) for case in GEM}
     return {key: array.astype(np.float32) for key, array in golden.items()}
-
-
-def _torchvision(folder: str) -> None:
-    """Its networks, without its operators, which belong to one version of torch."""
-    models = replace_module("torchvision.models", __path__=[f"{folder}/torchvision/models"])
-    replace_module("torchvision", __path__=[f"{folder}/torchvision"], __version__="0.28", models=models)
-    for part, maker in (("vgg", "vgg16"), ("resnet", "resnet50")):
-        setattr(models, maker, _untrained(getattr(importlib.import_module(f"torchvision.models.{part}"), maker)))
-
-
-def _untrained(maker: Callable) -> Callable:
-    return lambda **_: maker()
 
 
 def normalized(size: tuple[int, int]) -> Any:

@@ -11,7 +11,7 @@ from flax import nnx
 from mfvpr import InputError
 from mfvpr.features import AlikedFeatures
 from mfvpr.networks import Aliked
-from mfvpr.networks.aliked import DeformableConv, DescriptorHead, detect, field
+from mfvpr.networks.aliked import DeformableConv, DescriptorHead, _inside, detect, field
 from mfvpr.networks.sampling import sample, stretch
 from tests.builders import local
 from tests.golden.make_aliked import DRAWN, REAL, checkpoint, picture, projections, samples, texture
@@ -34,7 +34,15 @@ def everything(graph, state, images, threshold, capacity):
     """Dense maps and extracted features: one program per size for networks of the same shape."""
     network = nnx.merge(graph, state)
     images = images.astype(jnp.float32) / 255
-    return *network(images), *network.extract(images, threshold, capacity)
+    levels, scores = network.levels(images)
+    dense = jax.vmap(lambda levels: dense_map(field(levels, *_inside(images))))(levels)
+    return dense, scores, *network.extract(images, threshold, capacity)
+
+
+def dense_map(features):
+    """Features of all pixels of a field."""
+    y, x = jnp.indices(features.inverse_norm.shape)
+    return features.at(y.reshape(-1), x.reshape(-1)).reshape(*y.shape, -1)
 
 
 @pytest.fixture(scope="module")
@@ -132,7 +140,7 @@ def test_a_field_is_the_dense_map_where_it_is_asked_for():
         maps = [stretch(level, *levels[0].shape[:2]) for level in levels]
         plain = jnp.concatenate(maps, axis=-1)[window]
         plain /= jnp.linalg.norm(plain, axis=-1, keepdims=True)
-        return (features.dense(), features.sample(points), features.at(y, x)), (plain, sample(plain, points))
+        return (dense_map(features), features.sample(points), features.at(y, x)), (plain, sample(plain, points))
 
     (dense, sampled, pixels), (plain, expected) = both(levels)
     np.testing.assert_allclose(dense, plain, atol=1e-6)
@@ -152,7 +160,7 @@ def test_descriptors_agree_with_the_oracle_also_at_the_border():
     @jax.jit
     def described(levels):
         features = field(levels, slice(4, 30), slice(0, 32))
-        return head(features, jnp.asarray(points), 40), features.dense()
+        return head(features, jnp.asarray(points), 40), dense_map(features)
 
     descriptors, dense = described(pyramid(32, 32, 2))
     expected = [oracle.described(np.asarray(dense, np.float64), point, weights) for point in points]
@@ -254,24 +262,8 @@ def test_no_images_and_dark_images_have_no_features(unlimited):
     assert features.scores.shape == features.mask.shape == (0,)
 
 
-def test_other_variants_and_images_too_small_or_of_another_size_are_refused(drawn):
-    with pytest.raises(InputError, match=r"ALIKED: .*aliked-t16, .*got aliked-n64"):
-        Aliked("aliked-n64", rngs=nnx.Rngs(0))
+def test_images_too_small_or_of_another_size_are_refused(drawn):
     with pytest.raises(InputError, match=r"image_size=\(60, 4\): expected a list of 2, each a whole number from 16"):
         AlikedFeatures(drawn, (60, 4))
     with pytest.raises(InputError, match=r"AlikedFeatures: .*40 x 60 px, got 60 x 40$"):
         AlikedFeatures(Direct(), (40, 60))(crowded())
-
-
-def test_the_smallest_image_is_taken(drawn):
-    image = np.zeros((1, 16, 16, 3), np.uint8)
-    image[0, 7, 9] = 200
-    features = AlikedFeatures(Direct(), (16, 16))(image)[0].features
-    np.testing.assert_array_equal(features.keypoints, [[9, 7]])
-    detections, descriptors = jax.eval_shape(lambda: drawn.extract(image.astype(np.float32), 0.1, 25))
-    assert (detections.keypoints.shape, descriptors.shape) == ((1, 25, 2), (1, 25, 64))
-
-
-def test_the_forecast_grows_with_the_image(drawn):
-    for max_keypoints, typical_count in ((5000, 819), (None, 819), (300, 300)):
-        assert AlikedFeatures(drawn, max_keypoints=max_keypoints).scales[0].typical_count == typical_count

@@ -10,7 +10,7 @@ from mfvpr import InputError
 from mfvpr.features import D2NetFeatures, keypoint_networks
 from mfvpr.features.network import compile_network
 from mfvpr.networks import D2Net
-from mfvpr.networks.d2net import SCALES, detect, extract, select, survey
+from mfvpr.networks.d2net import detect, select, survey
 from mfvpr.networks.layers import preprocess
 from tests.builders import local
 from tests.golden.make_d2net import CASES, PLAIN, projections, samples, texture
@@ -215,25 +215,6 @@ def test_crowded_images_are_extracted_again(small, images, monkeypatch, memory):
         jax.tree.map(lambda ours, theirs: np.testing.assert_allclose(ours, theirs, rtol=1e-5), ours, expected)
 
 
-@pytest.mark.optimized
-@pytest.mark.slow
-def test_images_of_a_batch_do_not_mix(model, images):
-    extracted = compile_network(model, extract)
-    order = np.array([2, 0, 1])
-    (level,), (turned,) = extracted(images), extracted(images[order])
-    assert level.mask.any(1).all()
-    jax.tree.map(lambda ours, theirs: np.testing.assert_array_equal(ours[order], theirs), level, turned)
-
-
-def test_one_program_per_extractor(images, compilations):
-    extractor = D2NetFeatures(Tiny(), image_size=(64, 48), batch_size=2)
-    extractor(images)
-    compilations.reset()
-    extractor(images[:1])
-    extractor(images[::-1])
-    assert compilations.count == 0
-
-
 def test_the_highest_scores_are_kept_in_order(small, images):
     limited = D2NetFeatures(small.model, small.image_size, max_keypoints=4)
     for ours, unlimited in zip(local(limited(images)), local(small(images)), strict=True):
@@ -262,14 +243,3 @@ def test_images_too_small_or_of_another_size_are_refused(small, images, size, mu
         D2NetFeatures(Tiny(), image_size=size, multiscale=multiscale)
     with pytest.raises(InputError, match=r"expected images of 64 x 48 px, got 48 x 64"):
         small(images.swapaxes(1, 2))
-
-
-@pytest.mark.first_case
-@pytest.mark.parametrize(("size", "multiscale", "slots"), [((16, 16), False, 9), ((24, 24), True, 4)])
-def test_the_smallest_images_are_taken(model, size, multiscale, slots):
-    D2NetFeatures(Tiny(), size, multiscale=multiscale)(texture(*size)[None])
-    levels = jax.eval_shape(
-        lambda image: extract(model, image, scales=SCALES if multiscale else (1.0,)),
-        jax.ShapeDtypeStruct((1, *size, 3), jnp.uint8),
-    )
-    assert levels[0].keypoints.shape == (1, slots, 2)

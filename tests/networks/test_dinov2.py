@@ -11,8 +11,7 @@ from mfvpr.checkpoints.conversion import DINOV2
 from mfvpr.features import Dinov2Features, GlobalDescriptor
 from mfvpr.networks import VisionTransformer
 from mfvpr.networks.vit import TokenDescriptor
-from mfvpr.utils import InputError, recipe_of
-from mfvpr.utils.fingerprints import fingerprint
+from mfvpr.utils import InputError
 from tests.golden.make_dinov2 import CASES, HEADS, WIDTH
 from tests.golden.make_netvlad import image, name, samples
 from tests.networks.checkpoints import fill
@@ -100,12 +99,6 @@ def test_the_global_descriptor_is_the_class_token_of_retrieval():
     np.testing.assert_allclose(features(image(size))[0].vector, expected(image(size))[0].vector, atol=1e-6)
 
 
-def test_other_settings_have_other_recipes():
-    model = network()
-    settings = ({}, {"facet": "value"}, {"block": -2}, {"threshold": 0.05}, {"image_size": (42, 28)})
-    assert len({fingerprint(recipe_of(Dinov2Features(model, **each))) for each in settings}) == len(settings)
-
-
 @pytest.mark.parametrize(
     ("settings", "words"),
     [
@@ -119,13 +112,6 @@ def test_other_settings_have_other_recipes():
 def test_wrong_settings_are_one_line(settings, words):
     with pytest.raises(InputError, match=f"^{words}[^\n]*$"):
         Dinov2Features(network(), **settings)
-
-
-def test_another_network_and_images_of_another_size_are_one_line():
-    with pytest.raises(InputError, match="Dinov2Features: expected a VisionTransformer as model, got TokenDescriptor"):
-        Dinov2Features(TokenDescriptor(network()))
-    with pytest.raises(InputError, match=r"Dinov2Features: .*56 x 28 px, got 28 x 56"):
-        Dinov2Features(network(), (56, 28))(np.zeros((1, 56, 28, 3), np.uint8))
 
 
 @pytest.mark.optimized

@@ -13,14 +13,14 @@ import mfvpr
 from mfvpr.checkpoints.conversion import DINOV2, SELAVPR
 from mfvpr.features import GlobalDescriptor, SelaVprFeatures
 from mfvpr.networks import SelaVpr, VisionTransformer
-from mfvpr.networks.vit import AdaptedBlock, Block, TokenDescriptor, Upsampling
+from mfvpr.networks.vit import TokenDescriptor, Upsampling
 from mfvpr.utils import InputError, recipe_of
 from mfvpr.utils.fingerprints import fingerprint
 from tests.builders import make_matches
 from tests.golden.make_netvlad import image, name, samples
 from tests.golden.make_selavpr import BACKBONES, MATCHES, NETWORKS, SIZE, WIDTH, maps
 from tests.networks.checkpoints import fill
-from tests.networks.test_netvlad import assert_close, assert_separate_images
+from tests.networks.test_netvlad import assert_close
 from tests.random_checkpoints import dinov2_shapes, random_checkpoint, selavpr_shapes
 
 pytestmark = pytest.mark.thorough
@@ -118,19 +118,6 @@ def test_upsampling_is_the_sum_of_what_positions_add():
     np.testing.assert_allclose(layer(jnp.asarray(x)), expected, atol=1e-5)
 
 
-@pytest.mark.slow
-def test_without_adapters_an_adapted_block_is_a_plain_one():
-    with jax.numpy_dtype_promotion("standard"):
-        plain, adapted = (kind(64, 2, rngs=nnx.Rngs(0)) for kind in (Block, AdaptedBlock))
-    x = jax.random.normal(jax.random.key(1), (2, 5, 64))
-    for part in ("attention", "perceptron"):
-        nnx.update(getattr(adapted, part), nnx.state(getattr(plain, part)))
-    assert np.abs(adapted(x) - plain(x)).max() > 1e-3
-    for adapter in (adapted.serial, adapted.parallel):
-        adapter.output.kernel[...] = jnp.zeros_like(adapter.output.kernel[...])
-    np.testing.assert_array_equal(adapted(x), plain(x))
-
-
 def test_features_lie_between_the_middles_of_patches():
     size = (42, 28)
     extractor = SelaVprFeatures(network(width=64), size)
@@ -171,8 +158,3 @@ def test_tokens_are_descriptors_of_images():
         np.testing.assert_allclose(extractor(image(size))[0].vector, expected / np.linalg.norm(expected), atol=1e-6)
         recipes.add(fingerprint(recipe_of(extractor)))
     assert len(recipes) == 3  # stores of one are not read for another
-
-
-@pytest.mark.optimized
-def test_tokens_of_a_batch_do_not_see_each_other_and_one_program_is_compiled(compilations):
-    assert_separate_images(SelaVprFeatures(network(width=64), (28, 28)), compilations)

@@ -3,12 +3,9 @@
 from functools import cache, partial
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 import pytest
-from flax import nnx
 
-from mfvpr.networks.vgg import STAGE1_STRIDE, STAGE2_STRIDE
 from tests.golden.make_d2net import samples
 from tests.golden.make_ssm_maps import CASES, checkpoint
 from tests.networks.checkpoints import fill_published
@@ -52,16 +49,3 @@ def test_each_map_alone_is_the_public_codes(case, golden):
     for stage in case.stages:
         *_, dense = run(published(case.seed), images, stage)
         assert_same_map(dense, f"{case}/stage{stage}", golden)
-
-
-@pytest.mark.parametrize("width, height", [(224, 224), (336, 336), (448, 448), (416, 416), (33, 101), (1, 1)])
-def test_sizes_of_the_maps(width, height):
-    graph, state = nnx.split(published(0))
-    images = jax.ShapeDtypeStruct((2, height, width, 3), jnp.float32)
-
-    def compute(state, images, stage):
-        return nnx.merge(graph, state)(images, stage)
-
-    for stage, stride in ((1, STAGE1_STRIDE), (2, STAGE2_STRIDE)):
-        dense = jax.eval_shape(partial(compute, stage=stage), state, images)
-        assert dense.shape == (2, -(-height // stride), -(-width // stride), 512)

@@ -15,7 +15,7 @@ import pytest
 from mfvpr.evaluation import mcnemar
 from mfvpr.evaluation.statistics import path_test, recall_interval
 from mfvpr.report import pages
-from mfvpr.report.pages import Run, write_comparison, write_report
+from mfvpr.report.pages import write_comparison, write_report
 from mfvpr.utils import InputError
 from tests.programs import typed
 from tests.run_folders import HEADLINE, HOSTILE, RANKS, SYSTEMS, TOLERANCES, write_run
@@ -183,27 +183,20 @@ def test_runs_are_compared_query_by_query(tmp_path):
     [row] = [row for row in page.rows if row and row[0] == f"a: {HEADLINE}"]
     assert row == [f"a: {HEADLINE}", f"b: {HEADLINE}", "5", "2", *(f"{value:.2g}" for value in (test.p_value, *path))]
     assert [bar["x"] for bar in page.charts["intervals"]["data"]] == [[80.0, 50.0]]
-    assert [row[:2] for row in page.rows if row[0] in ("a", "b")][2:] == [
-        [run, system] for run in "ab" for system in SYSTEMS
-    ]
-    assert "Not comparable" not in "".join(page.text)
-    assert len(page.scripts) == 3
+    recalls = [row[:2] for row in page.rows if row[0] in ("a", "b") and row[1] in SYSTEMS]
+    assert recalls == [[run, system] for run in "ab" for system in SYSTEMS]
 
 
-@pytest.mark.parametrize(
-    ("changes", "reason"),
-    [
-        ({"data_fingerprint": {"database": "1"}}, "other images"),
-        ({"sequences": TWO}, "other queries"),
-        ({"ground_truth": {"kind": "order", "unit": "m", "thresholds": [25]}}, "another ground truth"),
-    ],
-)
-def test_runs_of_other_queries_are_not(tmp_path, changes, reason):
-    runs = [write_run(tmp_path / "a"), write_run(tmp_path / "b", **changes)]
-    assert pages.why_not(*map(Run, runs)) == reason
+def test_runs_of_other_queries_are_not(tmp_path):
+    changes = {
+        "other images": {"data_fingerprint": {"database": "1"}},
+        "other queries": {"sequences": TWO},
+        "another ground truth": {"ground_truth": {"kind": "order", "unit": "m", "thresholds": [25]}},
+    }
+    runs = [write_run(tmp_path / "a"), *(write_run(tmp_path / name, **values) for name, values in changes.items())]
     write_comparison(runs, tmp_path / "page.html")
-    page = Parsed(tmp_path / "page.html")
-    assert [row for row in page.rows if row[0] == f"a: {HEADLINE}"] == [[f"a: {HEADLINE}", f"b: {HEADLINE}", reason]]
+    pairs = [row for row in Parsed(tmp_path / "page.html").rows if row[0] == f"a: {HEADLINE}"]
+    assert pairs == [[f"a: {HEADLINE}", f"{reason}: {HEADLINE}", reason] for reason in changes]
 
 
 def test_the_program_says_where_the_page_is_or_what_is_wrong(run, tmp_path, monkeypatch, capsys):

@@ -84,18 +84,15 @@ def test_a_run_folder_says_which_predictions_a_sequence_changes(dataset, systems
     result = mfvpr.evaluate(dataset, replace(systems["paper"], sequences={"histogram": filters}))
     result.save(tmp_path / "run")
     lines = [[*line.values()] for line in csv_rows(tmp_path / "run" / "changes.csv")]
-    names, positives = dataset.database.names, dataset.truth.positives(2)
-    alone, expected = result.only.systems["histogram"][0].rows[:, 0], []
+    expected, alone = [], csv_rows(tmp_path / "run" / "predictions" / "histogram.csv")
     for method in ("causal", "smoothed"):
-        rows = result.only.systems[f"histogram + {method} sequence"][0].rows[:, 0]
-        correct, before = (positives.contains(each[:, None])[:, 0].astype(int) for each in (rows, alone))
-        expected += [
-            [f"histogram + {method} sequence", dataset.only.name, dataset.only.images.names[query], names[alone[query]],
-             str(before[query]), names[rows[query]], str(correct[query])]
-            for query in np.flatnonzero(alone != rows)
-        ]  # fmt: skip
-    assert lines == expected
-    assert lines
+        together = csv_rows(tmp_path / "run" / "predictions" / f"histogram_{method} sequence.csv")
+        pairs = ([line for line in table if line["rank"] == "1"] for table in (alone, together))
+        for before, after in zip(*pairs, strict=True):
+            cells = [before["database"], before["correct"], after["database"], after["correct"]]
+            if before["database"] != after["database"]:
+                expected.append([f"histogram + {method} sequence", dataset.only.name, before["query"], *cells])
+    assert lines == expected != []
     result.write_report(tmp_path / "report.html")
     assert "that the other queries of a drive change" in (tmp_path / "report.html").read_text()
 
