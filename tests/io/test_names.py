@@ -29,7 +29,6 @@ FILE = Path("feats.h5")
         (["@5.25@4.50@.jpg"], ["@5.25@4.50@", "@5.25@4.50"], ["@5.25@4.50@"]),
         (["a/1.jpg"], ["b/1.jpg"], [None]),  # another folder is another image
         (["img.jpg", "img.1.jpg"], ["img.1"], [None, "img.1"]),  # stems may hold dots
-        (["img.jpg"], ["img.1"], [None]),
         (["img.1.jpg"], ["img"], [None]),
         (["a/1.jpg", "b/1.jpg"], ["a/1.jpg", "1.png.h5"], ["a/1.jpg", None]),
         (["1.jpg", "x/1.jpg"], ["1.jpg"], ["1.jpg", None]),  # what is matched whole is not matched again
