@@ -28,8 +28,7 @@ from mfvpr.core.types import Shortlist
 from mfvpr.datasets.datasets import Dataset, folder
 from mfvpr.evaluation import System, rank_dataset
 from mfvpr.evaluation.drives import Drive, DriveFilter
-from mfvpr.evaluation.fusion import FrameCorrelation
-from mfvpr.evaluation.rankings import Ranked
+from mfvpr.evaluation.rankings import FrameCorrelation, Ranked
 from mfvpr.evaluation.statistics import path_test
 from mfvpr.retrieval import Retrieval
 from mfvpr.storage import FeatureCache

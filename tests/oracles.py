@@ -231,7 +231,7 @@ def aggregated_score(shifts, weights, size, *, mean="unweighted", clamp=False, c
     return score
 
 
-def grid_anchors(index, side, *, patch=None):
+def grid_anchors(index, side, *, patch=None, outside=-1000):
     """SSM-VPR's score of `index`: by row and column of the candidate the query's cell, None = no match."""
     size = int(0.75 * side) if patch is None else patch
     half = (size - (size % 2 == 0)) // 2
@@ -244,7 +244,7 @@ def grid_anchors(index, side, *, patch=None):
             for down in range(-half, half + 1):
                 for right in range(-half, half + 1):
                     inside = 0 <= row + down < side and 0 <= column + right < side
-                    other = index[row + down][column + right] if inside else -1000
+                    other = index[row + down][column + right] if inside else outside
                     score += other == anchor + down * side + right
     return score
 
@@ -252,7 +252,7 @@ def grid_anchors(index, side, *, patch=None):
 # --- fusion and ranking -------------------------------------------------------------------------------------
 
 
-def fuse_scales(scores, mask, weights, normalize):
+def fuse_scales(scores, mask, weights):
     """Sum over scales of z-scores over the candidates with a finite score, `[C, S]` -> `[C]` (Patch-NetVLAD)."""
     fused = np.full(len(mask), np.nan)
     real = [place for place in range(len(mask)) if mask[place]]
@@ -261,7 +261,7 @@ def fuse_scales(scores, mask, weights, normalize):
         for scale, weight in enumerate(weights):
             score = float(scores[place, scale])
             finite = [float(scores[row, scale]) for row in real if np.isfinite(scores[row, scale])]
-            if normalize == "zscore" and np.isfinite(score):
+            if np.isfinite(score):
                 deviation = np.std(finite) if min(finite) < max(finite) else 0.0
                 score = (score - np.mean(finite)) / deviation if deviation else 0.0
             fused[place] += weight * score

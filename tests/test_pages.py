@@ -8,8 +8,11 @@ import sys
 
 import pytest
 
+from mfvpr.cli import schema
 from mfvpr.cli.command_line import compose_data_sets
 from mfvpr.cli.programs import COMMANDS as PROGRAMS
+from mfvpr.systems.assembly import CONF, GROUPS, choices_of
+from mfvpr.utils.fields import settings_of
 from notebooks.draw_results import draw, query_times, real_recall
 from tests import programs
 from tests.needs import needs
@@ -118,6 +121,24 @@ def test_links_lead_somewhere(page):
 
 def slug(heading):
     return re.sub(r"[^\w\- ]", "", heading.lower()).replace(" ", "-")
+
+
+def test_settings_that_pages_name_exist():
+    text = re.sub(r"`hydra\.[^`]*`|`\w+=(?:True|False)`", "", "".join(PAGES.values()))  # of Hydra, and of Python
+    names = re.findall(r"`(?:[\w.]+\.)?([a-z]\w*)=[^`(]*`", text)
+    assert len(names) > 20
+    groups = {path.name for path in CONF.iterdir() if path.is_dir()} | {*GROUPS, "cluster", "name"}
+    known = set()
+    for owner in schema.PROGRAMS.values():
+        members = settings_of(owner)
+        known |= {*members} | {name for each in members.values() if isinstance(each, dict) for name in each}
+    known |= {name for group in GROUPS for each in choices_of(group).values() for name in each}
+    known |= {name for owner in schema.OTHERS for name in settings_of(owner)}
+    assert {*names} <= known | groups
+
+
+def test_pages_name_no_machine_path():
+    assert not re.search(r"/(work|tmp|root|home)/", "".join(PAGES.values()))
 
 
 def test_pictures_are_drawn_from_the_tables(tmp_path):

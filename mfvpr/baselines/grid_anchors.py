@@ -12,10 +12,10 @@ from jaxtyping import Float, Int
 from mfvpr.core.types import Array, Matches, value
 from mfvpr.core.weights import match_confidence
 from mfvpr.utils.errors import InputError
-from mfvpr.utils.fields import check_fields, setting, whole
+from mfvpr.utils.fields import check_fields, one_of, setting, whole
 from mfvpr.utils.numerics import masked
 
-_OUTSIDE = -1000  # padding around the grid in the public code on a CPU; equals no expected cell up to a side of 51
+_OUTSIDE = {"unequal": -1000, "zero": 0}
 
 
 @value
@@ -31,10 +31,15 @@ class GridAnchors:
     Attributes:
         side: cells per side of both images; every cell is a keypoint: 40 at 336 px, 26 at 224, 54 at 448.
         patch: n, odd and up to the side (else an InputError); None = 3/4 of the side, rounded down to an odd number.
+        outside: value of the padding: "unequal" (-1000) as in the public code on a CPU, which equals no expected cell
+            up to a side of 51; or "zero" as in that code on a GPU, where cell 0 of the query may be expected.
     """
 
     side: int = setting(40, whole(1, 74), "as the features have", unit="cells per side", swept=False, static=True)
     patch: int | None = setting(None, whole(1, 73) | None, "odd; None = 3/4 of the side", unit="cells", static=True)
+    outside: str = setting(
+        "unequal", one_of("unequal", "zero"), "the grid, of the CPU and of the GPU path", static=True
+    )
 
     def __post_init__(self) -> None:
         check_fields(self)
@@ -67,7 +72,7 @@ class GridAnchors:
         matched = index < len(cells)
         side, half = self.side, self.size // 2
         row, column = jnp.divmod(cells, side)
-        down, right = jnp.divmod(_OUTSIDE - index + half, side)  # the only offset to the padding, as n <= side
+        down, right = jnp.divmod(_OUTSIDE[self.outside] - index + half, side)  # the only offset to it, as n <= side
         right = right - half
         outside = (row + down < 0) | (row + down >= side) | (column + right < 0) | (column + right >= side)
         is_near = (jnp.abs(down) <= half) & (right <= half)

@@ -12,8 +12,8 @@ from mfvpr.datasets import Dataset
 from mfvpr.datasets.contents import fingerprints
 from mfvpr.datasets.ground_truth import middle
 from mfvpr.evaluation import Confidence, System, rank_dataset, read_confidences
+from mfvpr.evaluation.dataset_ranking import num_candidates
 from mfvpr.evaluation.evidence import evidence_against
-from mfvpr.evaluation.sequence_matching import num_candidates
 from mfvpr.report.evaluations import EvaluationReport, confidence_table, recall_table
 from mfvpr.report.figures import query_figures
 from mfvpr.report.run_files import RunDescription, ground_truth, heading, write_run_folder

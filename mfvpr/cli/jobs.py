@@ -19,8 +19,8 @@ from mfvpr.datasets.ground_truth import CHOICES, threshold_words
 from mfvpr.datasets.published import published_dataset, published_differences
 from mfvpr.datasets.streets import CONDITIONS, TRUTH, streets_folder
 from mfvpr.evaluation import EvaluationProtocol, Pipeline, evaluation_protocol, match_sequence
+from mfvpr.evaluation.dataset_ranking import matches_recipe, num_candidates
 from mfvpr.evaluation.protocol import Split
-from mfvpr.evaluation.sequence_matching import matches_recipe, num_candidates
 from mfvpr.evaluation.system import folders_of
 from mfvpr.matchers import MatchSet, Scales
 from mfvpr.report import pages, runs

@@ -30,7 +30,7 @@ from mfvpr.utils import Stopwatch, recipe_of
 from mfvpr.utils.errors import InputError
 from mfvpr.utils.fields import to_values
 from mfvpr.utils.files import expand_user, write_text
-from mfvpr.utils.fingerprints import fingerprint, versions
+from mfvpr.utils.fingerprints import versions
 
 _TRAINING = ("every", "patience", "batch", "learning_rate", "hidden", "seed")
 _INPUTS = {"relative": RELATIVE, "absolute": ABSOLUTE}
@@ -154,8 +154,7 @@ def _checkpoints(settings: Learn, axes: Axes, data: Part, sets: list[Prepared]) 
         "reported": dict(data.protocol.reported_sets),
         "versions": {name: versions()[name] for name in ("mfvpr", "jax", "numpy")},
     }
-    name = "" if settings.checkpoints else f"{settings.dataset['name']}_learning-{fingerprint(recipe)}"
-    return Checkpoints(expand_user(root) / name, recipe)
+    return Checkpoints(expand_user(root), recipe)
 
 
 def _heading(settings: Learn, data: Part, teach: list[Prepared], report: list[Prepared]) -> str:

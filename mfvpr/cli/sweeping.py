@@ -66,7 +66,6 @@ def sweep_program(settings: Settings) -> None:
         )
         with watch("sweep"):
             if settings.search == "grid":
-                axes.check(matches.image_sizes)
                 outcome = search_grid(axes, protocol, matches, candidates, options)
             else:
                 trials = {"trials": settings.trials, "seed": settings.seed}
@@ -92,7 +91,7 @@ def sweep_program(settings: Settings) -> None:
             write=lambda new: sweeps.write_sweep(new, outcome, heading, results),
             figures=sweeps.sweep_figures(outcome),
         )
-        forget_rankings(axes.scorer, options)
+        forget_rankings(axes.scorer, matches, candidates, outcome.protocol.views, options)
 
 
 def axes_of(settings: Searched) -> Axes:

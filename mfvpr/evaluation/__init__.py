@@ -1,7 +1,7 @@
 """Evaluation of all stages in one call: recall, precision, calibration, statistics.
 
-Read first: dataset_ranking (`rank_dataset`: all stages), sequence_matching and stages (its steps), protocol
-(choose settings on one half, report on the other), confidence, statistics.
+Read first: dataset_ranking (`rank_dataset`: all stages), stages (its steps), protocol (choose settings on one half,
+report on the other), confidence, statistics.
 """
 
 import lazy_loader

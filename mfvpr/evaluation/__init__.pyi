@@ -44,9 +44,8 @@ from .confidence import (
     reliability,
     write_confidences,
 )
-from .dataset_ranking import RankedDataset, Recall, rank_dataset
+from .dataset_ranking import RankedDataset, Recall, match_sequence, rank_dataset
 from .drives import Drive, DriveFilter
-from .fusion import FinalScore, FrameCorrelation, Fusion
 from .protocol import (
     EvaluationProtocol,
     Half,
@@ -57,7 +56,6 @@ from .protocol import (
     neighboring_settings,
     separate,
 )
-from .rankings import Matched, Ranked, balancing_c, fuse_scales
-from .sequence_matching import match_sequence
+from .rankings import FinalScore, FrameCorrelation, Fusion, Matched, Ranked, balancing_c, fuse_scales
 from .statistics import estimate, mcnemar
 from .system import Pipeline, System

@@ -26,7 +26,7 @@ _LEAST_WEIGHT = 1e-9  # of an input: less is a rest of the optimization, which w
 _FORMAT = "mfvpr confidence 3"
 _LEAST_SPREAD = 1e-3  # of the first score: less is rounding
 _PRIOR = 2  # added candidates of other places, with the variance of all candidates
-BINS = 10  # of probabilities from 0 to 1, by default
+BINS = 10  # of probabilities from 0 to 1
 
 
 def confidence_inputs(ranked: Ranked, *, apart: int = APART) -> Float[np.ndarray, "queries 2"]:
@@ -37,8 +37,7 @@ def confidence_inputs(ranked: Ranked, *, apart: int = APART) -> Float[np.ndarray
         drawn towards the standard deviation of all candidates; if there are none, the input is infinite.
     height: the same, with the mean score of candidates of other places instead of the best.
 
-    A larger input means a more confident prediction. Database images within `apart` rows of the prediction count as its
-    place.
+    Database images within `apart` rows of the prediction count as its place.
     """
     there = (ranked.rows >= 0) & np.isfinite(ranked.scores)
     scores = np.where(there, ranked.scores, 0.0).astype(np.float64)
@@ -85,21 +84,17 @@ class Confidence:
 def fit_confidence(
     values: Float[np.ndarray, "queries inputs"], correct: Bool[np.ndarray, " queries"], *, apart: int = APART
 ) -> Confidence:
-    """Fit a logistic model with weights of at least 0 by penalized maximum likelihood.
+    """Fit a logistic model with weights of at least 0 by penalized maximum likelihood; InputError without predictions.
 
     If larger inputs go with incorrect predictions, the probability does not depend on them. If all predictions are
     correct, it stays below 1: half a correct and half an incorrect prediction are added at the center.
 
     Args:
-        values: of `confidence_inputs` with this `apart`; rows that are not finite, without a prediction or without
-            candidates of other places, are left out.
+        values: of `confidence_inputs` with this `apart`; rows that are not finite are left out.
         correct: whether the top prediction is correct; False for queries without a place in the database.
-
-    Raises:
-        InputError: no predictions.
     """
     there = np.isfinite(values).all(axis=1)
-    values, correct = values[there], np.asarray(correct, bool)[there]
+    values, correct = values[there], correct[there]
     if not len(values):
         raise InputError("confidence: expected predictions to fit it on, with candidates of other places, got none")
     center, scale = values.mean(axis=0), values.std(axis=0)
@@ -135,7 +130,7 @@ class CalibrationData(NamedTuple):
         return int(np.isfinite(self.absent).all(axis=1).sum())
 
     def take(self, queries: Int[np.ndarray, " _"]) -> "CalibrationData":
-        """Select queries by their numbers."""
+        """The data of some queries."""
         return CalibrationData(*(values[queries] for values in self))
 
     def fit(self) -> Confidence:
@@ -170,10 +165,7 @@ def absent_ranking(ranked: Ranked, truth: Truth, threshold: float) -> Ranked:
 
 
 def write_confidences(path: Path | str, systems: Mapping[str, Confidence], recipe: Mapping[str, Any]) -> None:
-    """Write the confidences of systems by name as JSON, with the recipe of their rankings (JSON values).
-
-    An earlier file of confidences is replaced; an InputError for other files.
-    """
+    """Write confidences by name as JSON, with the recipe of their rankings; an InputError for another file."""
     require_replaceable(Path(path), _FORMAT.encode())
     values = {name: vars(confidence) for name, confidence in systems.items()}
     content = {"format": _FORMAT, "made": recipe, "systems": values}
@@ -189,20 +181,15 @@ def read_confidences(path: Path | str) -> tuple[dict[str, Confidence], dict[str,
         if content["format"] != _FORMAT:
             raise ValueError(f"format {content['format']!r}")
         return {name: confidence_from_json(each) for name, each in content["systems"].items()}, dict(content["made"])
-    except (OSError, ValueError, LookupError, TypeError, AttributeError, ArithmeticError, RecursionError) as error:
-        reason = error.strerror if isinstance(error, OSError) else f"{type(error).__name__}: {error}"
+    except (ValueError, LookupError, TypeError, AttributeError) as error:
+        reason = f"{type(error).__name__}: {error}"
         raise InputError(f"{path}: expected {expected} ({reason}); evaluate with ground truth to make one") from error
 
 
 def confidence_from_json(values: Mapping[str, Any]) -> Confidence:
-    """The confidence whose `vars` were written as JSON; a TypeError or ValueError for values that make no model."""
-    vectors = {name: tuple(values[name]) for name in ("center", "scale", "weights", "refusals")}
-    numbers = np.array([*vectors.values()], float)  # [4, 2]: two inputs, two shares
-    _, scale, weights, shares = numbers
-    is_fitted = numbers.shape == (4, 2) and np.isfinite(numbers).all() and np.isfinite(values["bias"])
-    if not (is_fitted and min(*scale, *shares) > 0 and min(weights) >= 0 and max(shares) <= 1):
-        raise ValueError("values that make no model")
-    return Confidence(**{**values, **vectors})
+    """The confidence whose `vars` were written as JSON; a TypeError for other fields."""
+    fields: Any = {name: tuple(value) if isinstance(value, list) else value for name, value in values.items()}
+    return Confidence(**fields)
 
 
 class PrecisionRecall(NamedTuple):
@@ -248,33 +235,26 @@ def precision_recall(
         confidence: any number that is larger for more confident predictions; NaN without a prediction.
         correct: whether the top prediction is correct.
         has_positives: queries with positives in the database; None = all. A prediction for another query is incorrect
-            and lowers the precision.
-
-    Raises:
-        InputError: a correct prediction for a query without positives.
+            and lowers the precision. An InputError if it is called correct.
     """
-    confidence, correct = np.asarray(confidence, np.float64), np.asarray(correct, bool)
-    has_positives = np.ones(len(correct), bool) if has_positives is None else np.asarray(has_positives, bool)
-    if np.any(correct & ~has_positives):
-        expected = "no correct predictions for queries without positives. Take both from one ground truth."
-        raise InputError(f"correct: expected {expected}")
+    if has_positives is not None and np.any(correct & ~has_positives):
+        raise InputError("correct: expected no correct predictions for queries without positives")
+    num_positive = len(correct) if has_positives is None else np.sum(has_positives)
     order = np.argsort(-confidence, kind="stable")[: np.sum(~np.isnan(confidence))]
     thresholds, hits = confidence[order], np.cumsum(correct[order])
     # Equal confidences, also infinite ones, share a threshold.
     last = np.flatnonzero(np.append(thresholds[1:] != thresholds[:-1], [True] * min(len(thresholds), 1)))
-    return PrecisionRecall(thresholds[last], hits[last] / (last + 1), hits[last] / max(has_positives.sum(), 1))
+    return PrecisionRecall(thresholds[last], hits[last] / (last + 1), hits[last] / max(num_positive, 1))
 
 
-def reliability(
-    probability: Float[np.ndarray, " queries"], correct: Bool[np.ndarray, " queries"], *, bins: int = BINS
-) -> Reliability:
-    """Compare probabilities with the fractions of correct predictions; NaN probabilities are left out."""
+def reliability(probability: Float[np.ndarray, " queries"], correct: Bool[np.ndarray, " queries"]) -> Reliability:
+    """Compare probabilities with the fractions of correct predictions, in 10 bins; NaN probabilities are left out."""
     there = ~np.isnan(probability)
-    probability, correct = probability[there], np.asarray(correct, bool)[there]
-    place = _bin_numbers(probability, bins)
-    count = np.bincount(place, minlength=bins)
+    probability, correct = probability[there], correct[there]
+    place = _bin_numbers(probability)
+    count = np.bincount(place, minlength=BINS)
     divisor = np.where(count > 0, count, np.nan)
-    mean, share = (np.bincount(place, weights=values, minlength=bins) / divisor for values in (probability, correct))
+    mean, share = (np.bincount(place, weights=values, minlength=BINS) / divisor for values in (probability, correct))
     return Reliability(mean, share, count)
 
 
@@ -283,7 +263,7 @@ def chance_calibration_error(probability: Float[np.ndarray, " queries"]) -> floa
     probability = probability[~np.isnan(probability)]
     if not len(probability):
         return float("nan")
-    place, distance = _bin_numbers(probability, BINS), 0.0
+    place, distance = _bin_numbers(probability), 0.0
     for number in range(BINS):
         inside, chances = probability[place == number], np.ones(1)  # of 0 ... correct predictions in the bin
         for value in inside:
@@ -292,5 +272,5 @@ def chance_calibration_error(probability: Float[np.ndarray, " queries"]) -> floa
     return float(distance / len(probability))
 
 
-def _bin_numbers(probability: np.ndarray, bins: int) -> np.ndarray:
-    return np.clip((probability * bins).astype(int), 0, bins - 1)
+def _bin_numbers(probability: np.ndarray) -> np.ndarray:
+    return np.clip((probability * BINS).astype(int), 0, BINS - 1)

@@ -40,7 +40,7 @@ _STEADY = 0.95  # otherwise, probability that it stays; else it changes by a few
 _BESIDE = 1.0  # rows, standard deviation: candidates speak for the rows next to them
 _MOST_ODDS = 50.0  # of a correct prediction: images may look like those of another place
 _REACH = 4  # standard deviations of the motion
-_MOST_ROWS, _MOST_SPREAD = 10_000, 100  # rows from one image to the next
+_EXACT = jax.lax.Precision.HIGHEST
 
 # Confidence that a top prediction is correct, if half of the queries show a place that is not in the database: fitted
 # on all scores of `scorer=demo`, SIFT, on seven drives through the synthetic street (`dataset=streets_seasons`), by
@@ -62,7 +62,6 @@ class Drive:
         leaves: probability, for each image, that the robot leaves the map.
         returns: probability, for each image, that a robot that left the map is on it again.
         correct: probability that the top prediction is correct while the robot is on the map.
-
     """
 
     advance: float | None = None
@@ -73,12 +72,10 @@ class Drive:
     correct: float = 0.75
 
     def __post_init__(self) -> None:
-        advance = self.advance or 0.0
         if wrong := [each for each in vars(self).values() if not isinstance(each, int | float | None)]:
             raise InputError(f"{self}: expected numbers, got {wrong[0]!r}")
-        if not (abs(advance) <= _MOST_ROWS and 1 / _MOST_ROWS <= self.spread <= _MOST_SPREAD):
-            expected = f"at most {_MOST_ROWS} rows, and a spread from {1 / _MOST_ROWS:g} to {_MOST_SPREAD}"
-            raise InputError(f"{self}: expected {expected}")
+        if not (abs(self.advance or 0) <= 10_000 and 1e-4 <= self.spread <= 100):
+            raise InputError(f"{self}: expected at most 10000 rows, and a spread from 0.0001 to 100")
         if not all(0 <= p <= 1 for p in (self.kidnapped, self.leaves, self.correct)) or not 0 < self.returns <= 1:
             raise InputError(f"{self}: expected probabilities from 0 to 1, and returns above 0")
 
@@ -159,7 +156,7 @@ class DriveModel:
     ) -> tuple[Float[Array, "speeds rows"], Float[Array, ""]]:
         """The belief after the next image, of total 1, and the image's probability, from its likelihood."""
         reach, size = self.reach, len(self.there)
-        wide = jnp.pad(self._changed(self.changes.T, belief), ((0, 0), (2 * reach, 2 * reach)))
+        wide = jnp.pad(jnp.matmul(self.changes.T, belief, precision=_EXACT), ((0, 0), (2 * reach, 2 * reach)))
         starts = reach - self.shifts - self.steps.shape[1] // 2
         moved = (1 - self.kidnapped) * self._convolve(wide, self.steps[:, ::-1], starts, size + 2 * reach)
         outside = jnp.where(self._is_inside, 0.0, moved).sum()
@@ -176,7 +173,7 @@ class DriveModel:
         anywhere = (later * self.anywhere).sum()
         wide = jnp.where(self._is_inside, jnp.pad(later, ((0, 0), (self.reach, self.reach))), anywhere)
         starts = self.reach + self.shifts - self.steps.shape[1] // 2
-        moved = self._changed(self.changes, self._convolve(wide, self.steps, starts, len(self.there)))
+        moved = jnp.matmul(self.changes, self._convolve(wide, self.steps, starts, len(self.there)), precision=_EXACT)
         seen = (1 - self.kidnapped) * moved + self.kidnapped * anywhere
         return jnp.where(seen.max() > 0, seen / jnp.where(seen.max() > 0, seen.max(), 1.0), 1.0)
 
@@ -185,7 +182,7 @@ class DriveModel:
         size, beside = len(self.there), _gaussian(0.0, _BESIDE)
         places = jnp.where(evidence.rows < 0, size, evidence.rows)  # beyond the end: dropped
         shares = jnp.zeros(size).at[places].add(evidence.shares, mode="drop")
-        shares = jnp.convolve(shares, beside, precision=jax.lax.Precision.HIGHEST)[len(beside) // 2 :][:size]
+        shares = jnp.convolve(shares, beside, precision=_EXACT)[len(beside) // 2 :][:size]
         near = jnp.where(self.there, shares, 0.0)
         total = near.sum()
         relative = near * jnp.sum(self.there, dtype=near.dtype) / jnp.where(total > 0, total, 1.0)
@@ -201,10 +198,6 @@ class DriveModel:
         """Whether rows from -reach to size + reach are on the map or in a gap."""
         rows = jnp.arange(-self.reach, len(self.there) + self.reach)
         return ((rows >= 0) & (rows < len(self.there) - jnp.argmax(self.there[::-1])))[None]
-
-    def _changed(self, changes: Array, values: Array) -> Array:
-        """Products of changes `[speeds, speeds]` and values `[speeds, rows]`."""
-        return jnp.matmul(changes, values, precision=jax.lax.Precision.HIGHEST)
 
     def _convolve(self, values: Array, steps: Array, starts: Array, size: int) -> Array:
         """Totals over k of steps[v, k] * values[v, starts[v] + k + row], for `size` rows."""
@@ -238,6 +231,7 @@ def off_the_map(drive: Drive, off: float, chance: float) -> float:
 
 
 Method = Literal["causal", "lagged", "smoothed"]
+Rows = Bool[np.ndarray, " rows"]  # of the database, that are there
 LAG = 5  # images
 
 
@@ -281,24 +275,18 @@ class DriveFilter:
         Scores are probabilities of the rows, small if the query seems to show a place that is not in the database.
         Rows that a query has in `excluded` are not ranked.
         """
-        size = ranked.rows.shape[1]
-        left_out = 0 if excluded is None else int(excluded.sum(axis=1).max(initial=0))
-        followed = follow(Evidence.of(ranked), self.drive, np.ones(num_rows, bool), self.method, size + left_out)
-        rows, p = followed.rows, followed.p * (1 - followed.off[:, None])
-        if excluded is None:
-            return Ranked(rows, p)
-        is_left_out = np.take_along_axis(excluded, rows, axis=1)
-        order = np.argsort(is_left_out, axis=1, kind="stable")[:, :size]
-        values = np.where(is_left_out, -1, rows), np.where(is_left_out, np.nan, p)
+        hidden = np.zeros((len(ranked.rows), num_rows), bool) if excluded is None else excluded
+        size, most_hidden = ranked.rows.shape[1], int(hidden.sum(axis=1).max(initial=0))
+        followed = follow(Evidence.of(ranked), self.drive, np.ones(num_rows, bool), self.method, size + most_hidden)
+        is_hidden = np.take_along_axis(hidden, followed.rows, axis=1)
+        order = np.argsort(is_hidden, axis=1, kind="stable")[:, :size]
+        p = followed.p * (1 - followed.off[:, None])
+        values = np.where(is_hidden, -1, followed.rows), np.where(is_hidden, np.nan, p)
         return Ranked(*(np.take_along_axis(each, order, axis=1) for each in values))
 
 
 def follow(
-    evidence: Evidence,
-    drive: Drive,
-    there: Bool[np.ndarray, " rows"],
-    method: Method = "causal",
-    depth: int | None = None,
+    evidence: Evidence, drive: Drive, there: Rows, method: Method = "causal", depth: int | None = None
 ) -> Followed:
     """The first `depth` rows of each image of a drive, None = as many as candidates; see `DriveFilter`."""
     images, candidates = evidence.rows.shape

@@ -3,12 +3,10 @@
 A confidence compares the scores of one query with each other, so a black image can look certain. The tests here are
 absolute. An image is noise if its brightness at points near to each other has nothing in common, blurred if it is
 nearly the same there, and overexposed if most of the image is white. The strength of an image is the sum of its
-detection scores; the strength of a query is compared with the mean strength of the database images. The score of a
-query with its best candidate, a histogram of shifts weighted by ratio, is compared with the best scores of a few images
-of random pixels in the same database.
+detection scores, compared with the mean of database images. The score of a query with its best candidate, a histogram
+of shifts weighted by ratio, is compared with the best scores of a few images of random pixels in the same database.
 
-The tests refuse lens caps, plain images, very dark, blurred or overexposed images, and noise. They do not refuse images
-of places that the database does not show.
+The tests do not refuse images of places that the database does not show.
 """
 
 import tempfile
@@ -25,20 +23,18 @@ from mfvpr.core.weights import RatioWeight
 from mfvpr.datasets.datasets import ImageFolder, QuerySequence, image_folder
 from mfvpr.datasets.image_reading import gray, resize, write_image
 from mfvpr.evaluation import stages
-from mfvpr.evaluation.dataset_ranking import RankedDataset, Reason
+from mfvpr.evaluation.dataset_ranking import RankedDataset, Reason, match_sequence
 from mfvpr.evaluation.rankings import Matched
-from mfvpr.evaluation.sequence_matching import match_sequence
 from mfvpr.evaluation.system import Pipeline, noise_images
 from mfvpr.features.extractor import Source
 from mfvpr.features.feature_set import strength
 from mfvpr.retrieval.retriever import Retrieval
 from mfvpr.storage.feature_cache import FeatureCache
 
-# Round numbers. The first two were chosen with two real sets in view, a park path and a corridor: results on those sets
-# are no independent test. The last was chosen on synthetic streets and the park path.
 # Of brightness at an 80th of the image's side, chosen on synthetic streets: noise has at most 0.19, streets have from
 # 0.64 to 0.94, and streets that are blurred over 8 % of the width at least 0.97.
 _LEAST_CORRELATION, _MOST_CORRELATION = 0.3, 0.97
+# Round numbers, chosen with a park path, a corridor and synthetic streets in view: they are no independent test.
 _MOST_WHITE = 0.6  # share of the image
 LEAST_STRENGTH = 0.05  # of the mean strength of the database images
 LEAST_MATCHES = 8  # of a query with its best candidate
@@ -96,8 +92,7 @@ def evidence_against(ranked: RankedDataset, cache: FeatureCache) -> list[list[Re
     for matched, ranking in zip(ranked.matched, ranked.systems[ranked.system.headline], strict=True):
         images = matched.sequence.images
         is_weak = _strengths(images, pipeline, cache, range(len(images))) < least
-        place = np.argmax(matched.candidates.indices == ranking.rows[:, :1], axis=1)
-        pairs = np.arange(len(images)), place
+        pairs = np.arange(len(images)), np.argmax(matched.candidates.indices == ranking.rows[:, :1], axis=1)
         counts = np.sum([match_set.counts[pairs] for match_set in matched.matches], axis=0)
         of_sequence: list[Reason | None] = []
         for row, (weak, count, score) in enumerate(zip(is_weak, counts, _scores(matched)[pairs], strict=True)):

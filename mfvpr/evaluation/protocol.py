@@ -1,6 +1,5 @@
 """The protocol of an evaluation: which queries choose settings, which are reported on, and what is correct."""
 
-import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
@@ -33,9 +32,6 @@ class Half(NamedTuple):
 def halves(positives: Positives) -> tuple[Half, Half]:
     """Split the queries into two contiguous blocks; each block is reported on once.
 
-    Choosing sees nothing of the reported places: database rows that show the place of a reported query are not allowed,
-    and queries whose place such a row shows are left out (they are neighbors across the cut).
-
     `positives` are all database images of a query's place within the widest threshold, the query itself included.
     """
     first, second = np.split(np.arange(len(positives)), [len(positives) // 2])
@@ -62,7 +58,11 @@ def halves_of_map(parts: Sequence[Positives], unit: Unit) -> tuple[Half, Half]:
 
 
 def separate(positives: Positives, tune: Int[np.ndarray, " tune"], report: Int[np.ndarray, " report"]) -> Half:
-    """Leave out query rows to choose on that share a place with a row to report on; see `halves`."""
+    """A half, in which choosing sees nothing of the reported places.
+
+    Database rows that show the place of a reported query are not allowed, and queries whose place such a row shows are
+    left out (they are neighbors across the cut).
+    """
     is_free = np.ones(positives.num_database, bool)
     is_free[positives.take(report).rows] = False
     is_apart = np.array([is_free[positives.of(query)].all() for query in tune], bool)
@@ -72,21 +72,14 @@ def separate(positives: Positives, tune: Int[np.ndarray, " tune"], report: Int[n
 def neighboring_settings(axes: Mapping[str, Sequence[Any]], setting: int) -> list[int]:
     """Numbers of the settings of a grid that differ from a setting by one step along one axis."""
     shape = tuple(map(len, axes.values()))
-    numbers = np.arange(math.prod(shape)).reshape(shape)
-    place = np.unravel_index(setting, shape)
-    around = []
-    for axis, index in enumerate(place):
-        line = numbers[(*place[:axis], slice(None), *place[axis + 1 :])]
-        around += [*line[max(index - 1, 0) : index], *line[index + 1 : index + 2]]
-    return list(map(int, around))
+    place = np.array(np.unravel_index(setting, shape))
+    steps = [sign * step for step in np.eye(len(shape), dtype=int) for sign in (-1, 1)]
+    around = [tuple(place + step) for step in steps if ((place + step >= 0) & (place + step < shape)).all()]
+    return [int(np.ravel_multi_index(each, shape)) for each in around]
 
 
 def best_setting(recall: Float[np.ndarray, " settings"], axes: Mapping[str, Sequence[Any]] | None = None) -> int:
-    """The number of the setting with the highest recall.
-
-    Among equal settings, the neighbors in the grid decide by their mean recall, which makes the choice depend less on
-    luck. Then the first setting wins.
-    """
+    """The number of the setting with the highest recall; of equal ones, that with the best neighbors in the grid."""
     equal = np.flatnonzero(recall == recall.max())
     if axes is None:
         return int(equal[0])
@@ -95,16 +88,13 @@ def best_setting(recall: Float[np.ndarray, " settings"], axes: Mapping[str, Sequ
 
 
 def places_along_path(shown: Positives, unit: Unit) -> Int[np.ndarray, " queries"]:
-    """Places of the queries of one or several drives: whole numbers from 0 in the order of the map.
-
-    Neighbors along a path fail together, which confidence intervals and tests must consider.
+    """Places of the queries of one or several drives: whole numbers from 0 in the order of the map, -1 = none.
 
     Frames of the map are in the order of their rows. Images with positions may have any order: two images are neighbors
     if they show the place of the same query, and each connected part of the map is traversed from one of its ends. With
     the unit "exact", images are in the order of the first queries that they show.
 
-    `shown` are images of the map that show each query's place, within a tolerance or a radius. The result is -1 for a
-    query whose place no image shows.
+    `shown` are images of the map that show each query's place, within a tolerance or a radius.
     """
     order = _traversal_order(shown) if unit == "m" else np.arange(shown.num_database)
     if unit == "exact":  # the first query whose place each image shows
@@ -162,7 +152,7 @@ class EvaluationProtocol:
         return content_hash([(positives.offsets, positives.rows) for positives in self.positives])
 
     def of(self, candidates: Shortlist) -> "EvaluationProtocol":
-        """This protocol with the views of a shortlist."""
+        """The protocol with the views of a shortlist."""
         allowed = [half.allowed[np.maximum(candidates.indices, 0)] for half in self.halves]
         return replace(self, views=[candidates.mask, *(candidates.mask & rows for rows in allowed)])
 
@@ -170,11 +160,17 @@ class EvaluationProtocol:
         """R@K with its threshold, for tables."""
         return f"R@{k}{threshold_words(self.unit, threshold)}"
 
+    def hits(
+        self, rows: Int[np.ndarray, "*batch queries depth"], queries: Int[np.ndarray, " queries"], k: int = 1
+    ) -> Bool[np.ndarray, "tolerances *batch queries"]:
+        """Whether the first k rows of the rankings of some queries have a positive, by threshold."""
+        return np.stack([hits(rows, positives.take(queries), k) for positives in self.positives])
+
     def recall(
         self, rows: Int[np.ndarray, "settings queries depth"], k: int = 1
     ) -> Float[np.ndarray, "settings tolerances"]:
         """Recall@k over all queries."""
-        return np.stack([hits(rows, positives, k).mean(axis=-1) for positives in self.positives], axis=-1)
+        return self.hits(rows, np.arange(rows.shape[1]), k).mean(axis=-1).T
 
     def tuning(
         self, rows: Int[np.ndarray, "views settings queries depth"]
@@ -182,23 +178,17 @@ class EvaluationProtocol:
         """Recall@1 over the queries to choose on."""
         if not self.halves:
             return self.recall(rows[0])[None]
-        seen = [
-            [hits(rows[view][:, half.tune], positives.take(half.tune)).mean(axis=-1) for positives in self.positives]
-            for view, half in enumerate(self.halves, start=1)
-        ]
-        return np.moveaxis(np.array(seen), 1, -1)
+        views = zip(rows[1:], self.halves, strict=False)
+        return np.stack([self.hits(view[:, half.tune], half.tune).mean(axis=-1).T for view, half in views])
 
     def reported_hits(
         self, rows: Int[np.ndarray, "views settings queries depth"], chosen: Sequence[int]
     ) -> Bool[np.ndarray, "tolerances reported"]:
         """Hits of the queries to report on, each with the setting that was chosen without it."""
         if not self.halves:
-            return np.stack([hits(rows[0][chosen[0]], positives) for positives in self.positives])[:, self.order]
-        parts = [
-            [hits(rows[0][setting][half.report], positives.take(half.report)) for positives in self.positives]
-            for setting, half in zip(chosen, self.halves, strict=True)
-        ]
-        return self.join_halves([np.array(part) for part in parts])
+            return self.hits(rows[0][chosen[0]], np.arange(rows.shape[2]))[:, self.order]
+        parts = zip(chosen, self.halves, strict=True)
+        return self.join_halves([self.hits(rows[0][setting][half.report], half.report) for setting, half in parts])
 
     def join_halves(self, parts: Sequence[Bool[np.ndarray, "tolerances _"]]) -> Bool[np.ndarray, "tolerances reported"]:
         """Join the hits of each half in the order of the path, which confidence intervals depend on."""

@@ -1,9 +1,9 @@
-"""Matches and rankings of a sequence of queries, and scores of shortlists: of the retrieval, fused, and ranked."""
+"""Rankings of candidates by the scores of a system: of retrieval, of each scorer, and combined ones."""
 
-from collections.abc import Mapping
-from dataclasses import dataclass
-from functools import partial
-from typing import Literal
+from collections import deque
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Literal
 
 import jax
 import jax.numpy as jnp
@@ -15,125 +15,16 @@ from mfvpr.core.types import Array, Shortlist
 from mfvpr.datasets.datasets import QuerySequence
 from mfvpr.matchers.match_set import MatchSet, Scales
 from mfvpr.utils.errors import InputError, require_word
-from mfvpr.utils.numerics import at_least_single, compiled, is_concrete, masked, masked_mean, safe_sqrt
+from mfvpr.utils.fields import NOT_NEGATIVE, POSITIVE
+from mfvpr.utils.numerics import at_least_single, compiled, masked, masked_mean, safe_sqrt
+
+if TYPE_CHECKING:
+    from mfvpr.evaluation.drives import DriveFilter  # which ranks the rankings of this module again
 
 Ties = Literal["retrieval", "index"]
 RetrievalScore = Literal["cosine", "negative_euclidean"]
 Scores = Float[np.ndarray, "queries candidates"]
-
-
-def balancing_c(
-    retrieval_scores: Num[Array, " candidates"],
-    rerank_scores: Num[Array, " candidates"],
-    mask: Bool[Array, " candidates"],
-) -> Float[jax.Array, ""]:
-    """The c with which both scores of one query's candidates have the same standard deviation, in any unit.
-
-        mfvpr.balancing_c(shortlist.scores[0], scores[0], shortlist.mask[0])
-
-    Candidates count if `mask` is True, and both `retrieval_scores` and `rerank_scores` are finite.
-    """
-    both = mask & jnp.isfinite(retrieval_scores) & jnp.isfinite(rerank_scores)
-    retrieval_deviation, deviation = (
-        _masked_std(at_least_32_bits(scores), both) for scores in (retrieval_scores, rerank_scores)
-    )
-    c = deviation / jnp.where(retrieval_deviation > 0, retrieval_deviation, 1.0)
-    return jnp.where((retrieval_deviation > 0) & jnp.isfinite(c), c, 0.0)
-
-
-@compiled
-def fuse(
-    retrieval_scores: Num[Array, "queries candidates"],
-    scores: Num[Array, "queries candidates"],
-    mask: Bool[Array, "queries candidates"],
-    c: float | Array | None,
-) -> Float[jax.Array, "queries candidates"]:
-    """Combined scores of several queries; None as `c` is `balancing_c` of each query."""
-    if c is None:
-        c = jax.vmap(balancing_c)(retrieval_scores, scores, mask)[:, None]
-    retrieval_scores, scores = masked(retrieval_scores, mask), masked(scores, mask)
-    return combine(retrieval_scores, scores, c=c)
-
-
-def fuse_shortlist(
-    candidates: Shortlist, scores: Scores, c: float | None, *, retrieval_score: RetrievalScore = "cosine"
-) -> Scores:
-    """Combined scores of retrieval and re-ranking, see `fuse`; NaN without a candidate."""
-    fused = fuse(retrieval_scores(candidates, retrieval_score), scores, candidates.mask, c)
-    return np.asarray(_or_nan(fused, candidates.mask))
-
-
-def retrieval_scores(candidates: Shortlist, kind: RetrievalScore = "cosine") -> Scores:
-    """Retrieval scores: cosine similarity, or minus the Euclidean distance, for scores up to 1 only."""
-    require_word("retrieval_score", kind, RetrievalScore)
-    cosine = candidates.scores
-    if kind == "cosine":
-        return cosine
-    if (largest := np.max(cosine, initial=0, where=candidates.mask)) > 1 + 1e-3:
-        raise InputError(
-            f"retrieval_score=negative_euclidean: expected cosine similarities up to 1, got {largest:.4g}; use cosine, "
-            "which takes any score"
-        )
-    return -np.sqrt(np.maximum(2 - 2 * cosine, 0))
-
-
-def fuse_scales(
-    scores: Num[Array, "*batch candidates scales"],
-    mask: Bool[Array, "... candidates"],
-    weights: Num[Array, " scales"] | None = None,
-    *,
-    normalize: Literal["zscore", "none"] = "zscore",
-) -> Float[jax.Array, "*batch candidates"]:
-    """Weighted sum of the scores of S scales or scorers; NaN without a candidate. `weights` are 1 by default.
-
-    Patch-NetVLAD fuses patch sizes in this way. "zscore" first gives each scale mean 0 and standard deviation 1 over
-    the query's candidates, or 0 if all scores are equal. A score that is not finite is left out of mean and deviation,
-    and affects only the sum of its own candidate. "none" leaves the scores as they are, for pairs without other
-    candidates.
-    """
-    return _or_nan(_fuse_scales(scores, mask, weights, normalize=normalize), mask)
-
-
-@partial(compiled, static_argnames="normalize")
-def _fuse_scales(scores: Array, mask: Array, weights: Array | None, *, normalize: str) -> Array:
-    """`fuse_scales`, 0 without a candidate."""
-    scores = at_least_single(scores)
-    weights = jnp.ones(scores.shape[-1]) if weights is None else jnp.asarray(weights)
-    mask = jnp.broadcast_to(mask, scores.shape[:-1])
-    if normalize == "zscore":
-        by_scale = jnp.moveaxis(scores, -1, -2)
-        standardize = jnp.vectorize(_standardize, signature="(c),(c)->(c)")
-        scores = jnp.moveaxis(standardize(by_scale, mask[..., None, :]), -2, -1)
-    counts = jnp.expand_dims(weights != 0, tuple(range(scores.ndim - 1)))
-    scores = jnp.where(mask[..., None] & counts, scores, 0.0)  # infinity times 0 would be NaN
-    return jnp.matmul(scores, weights.astype(scores.dtype), precision=jax.lax.Precision.HIGHEST)
-
-
-def _standardize(scores: Float[Array, " candidates"], mask: Bool[Array, " candidates"]) -> Array:
-    """Scores with mean 0 and standard deviation 1 over the finite scores of candidates."""
-    finite = mask & jnp.isfinite(scores)
-    # Relative to the maximum, equal scores deviate by exactly 0, without rounding.
-    maximum = jax.lax.stop_gradient(jnp.max(masked(scores, finite, -jnp.inf), initial=-jnp.inf))
-    values = masked(scores - jnp.where(jnp.isfinite(maximum), maximum, 0.0), finite)
-    largest = jax.lax.stop_gradient(jnp.max(jnp.abs(values), initial=0.0))  # its square may overflow
-    values = values / jnp.where((largest > 0) & jnp.isfinite(largest), largest, 1.0)
-    mean, deviation = masked_mean(values, finite), _masked_std(values, finite)
-    return jnp.where(finite, (values - mean) / jnp.where(deviation > 0, deviation, 1.0), scores)
-
-
-def breaks_ties_by_row(ties: Ties) -> bool:
-    """Whether ties are broken by the database row."""
-    require_word("ties", ties, Ties)
-    return ties == "index"
-
-
-def rank_shortlist(
-    candidates: Shortlist, scores: Scores, *, ties: Ties = "retrieval"
-) -> Int[np.ndarray, "queries candidates"]:
-    """Positions into the shortlist, best first, missing candidates last; ties by retrieval or by database index."""
-    tie_break = candidates.indices if breaks_ties_by_row(ties) else None
-    return np.asarray(rank(scores, candidates.mask, tie_break=tie_break))
-
+AnyScores = Num[Array, "queries candidates"]
 
 RETRIEVAL = "retrieval"  # name of the retrieval's own ranking
 SEQUENCE = "sequence"  # in names of rankings by the motion along a drive
@@ -167,6 +58,12 @@ class Ranked:
     rows: Int[np.ndarray, "queries candidates"]  # of the database, best first; -1 = none
     scores: Scores  # in this order
 
+    @classmethod
+    def of(cls, candidates: Shortlist, scores: Scores, ties: Ties) -> "Ranked":
+        """Rank candidates by scores in the order of the shortlist."""
+        order, rows = rank_shortlist(candidates, scores, ties=ties), np.where(candidates.mask, candidates.indices, -1)
+        return cls(*(np.take_along_axis(values, order, axis=1) for values in (rows, scores)))
+
     def __repr__(self) -> str:
         return "Ranked({} queries, {} candidates each)".format(*self.rows.shape)
 
@@ -177,14 +74,265 @@ class Ranked:
         return Shortlist(indices=self.rows, scores=np.where(mask, self.scores, 0), mask=mask)
 
 
+@dataclass(frozen=True)
+class Fusion:
+    """Sum of a main score, the retrieval score, and the scores of further scorers.
+
+    Attributes:
+        c: the combined score is main score + c * retrieval score; None = `balancing_c` of each query. "zscore" = the
+            sum of all scores, each with mean 0 and standard deviation 1 over the query's candidates (0 if all are
+            equal). With retrieval and main score only, "zscore" ranks finite scores as None does, but its values have
+            the same unit for every query. A score that is not finite affects only its own candidate.
+        retrieval_score: kind of retrieval score, see `mfvpr.evaluation.rankings.retrieval_scores`.
+        weights: for "zscore" only, above 0, by name: of `retrieval` and of the main scorer, by default 1;
+            and of further scorers, which take part only if they are named here.
+    """
+
+    c: float | Literal["zscore"] | None = None
+    retrieval_score: RetrievalScore = "cosine"
+    weights: Mapping[str, float] = field(default_factory=dict)
+
+    def members(self, main: str) -> list[str]:
+        """Names of the scorers that take part, the main one first."""
+        return [main, *(name for name in self.weights if name not in (main, RETRIEVAL))]
+
+    def system(self, main: str) -> str:
+        """Name of the fused system, such as `histogram + retrieval`."""
+        return " + ".join([*self.members(main), RETRIEVAL])
+
+    def check(self, main: str, scorers: Collection[str]) -> None:
+        """Raise an InputError if a setting is out of bounds, or a name is not among those of all `scorers`."""
+        require_word("retrieval_score", self.retrieval_score, RetrievalScore)
+        known = ", ".join(scorers) or "there are none"
+        if main not in scorers:
+            raise InputError(f"fused: expected names of scorers ({known}), got {main}")
+        if self.c not in (None, "zscore") and not NOT_NEGATIVE.holds(self.c):
+            raise InputError(f"c={self.c!r}: expected {NOT_NEGATIVE.expected}, 'zscore', or None")
+        if self.weights and self.c != "zscore":
+            raise InputError(f"weights: expected c='zscore' as well, got c={self.c!r}")
+        for name, weight in self.weights.items():
+            if name not in {RETRIEVAL, *scorers}:
+                raise InputError(f"weights: expected {RETRIEVAL} or scorers ({known}), got {name}; score by it as well")
+            POSITIVE.check(f"weights.{name}", weight)
+
+    def __call__(self, main: str, candidates: Shortlist, scores: Mapping[str, Scores]) -> Scores:
+        """Combined scores, from scores by name of the scorer."""
+        if self.c != "zscore":
+            return fuse_shortlist(candidates, scores[main], self.c, retrieval_score=self.retrieval_score)
+        parts = {RETRIEVAL: retrieval_scores(candidates, self.retrieval_score)}
+        parts |= {name: scores[name] for name in self.members(main)}
+        weights = np.array([self.weights.get(name, 1.0) for name in parts], np.float32)
+        return np.asarray(fuse_scales(np.stack([*parts.values()], axis=-1), candidates.mask, weights))
+
+
+@dataclass(frozen=True)
+class FrameCorrelation:
+    """Increase the scores of candidates near the places of the previous queries (Camara & Preucil, RAS 2020).
+
+    The place of a query is its best candidate. A candidate d database rows from the place of a previous query gains
+    strength * gain * (1 - d / reach) of its score; the largest gain over the previous queries counts. The strength is
+    the score of that place over the best score of the previous places, and 1 if `previous` is 1 or all scores are 0.
+    Queries and database images must be in the order of the drive.
+
+    Attributes:
+        previous: number of previous queries, from 1; the first `previous` queries keep their scores.
+        reach: database rows.
+        gain: largest relative increase of a score.
+    """
+
+    previous: int = 2
+    reach: float = 15.0
+    gain: float = 0.4
+
+    def __post_init__(self) -> None:
+        if self.previous < 1 or not 0 < self.reach < np.inf or not 0 <= self.gain < np.inf:
+            expected = "at least one query, a finite reach above 0, a finite gain from 0"
+            raise InputError(f"{self}: expected {expected}")
+
+    def __call__(self, candidates: Shortlist, scores: Scores) -> Scores:
+        """Correlated scores of a sequence, float32.
+
+        Scores that are not above 0, and NaN, stay the same. Among equal scores the lowest row is the query's place.
+        """
+
+        def gains(rows: np.ndarray, before: Float[np.ndarray, "previous 2"]) -> np.ndarray:
+            """Largest relative gains of rows; `before` are places and scores."""
+            places, scores = before.T
+            best = scores.max()
+            strength = scores / best if best > 0 and self.previous > 1 else np.ones(len(scores))
+            nearness = np.maximum(1 - np.abs(rows[:, None] - places) / self.reach, 0)
+            return self.gain * np.max(strength * nearness, axis=1, initial=0)
+
+        mask, correlated = np.asarray(candidates.mask), np.array(scores, np.float64)
+        before: deque[tuple[float, float]] = deque(maxlen=self.previous)  # (row, score) of the last places
+        for row_scores, rows, usable in zip(correlated, np.asarray(candidates.indices, float), mask, strict=True):
+            positive = usable & (row_scores > 0)
+            if len(before) == self.previous:
+                row_scores[positive] *= 1 + gains(rows[positive], np.array(before))
+            best = row_scores.max(where=positive, initial=0)
+            before.append((rows.min(where=positive & (row_scores == best), initial=np.inf), best))
+        return correlated.astype(np.float32)
+
+
+@dataclass(frozen=True)
+class FinalScore:
+    """A score that candidates are ranked by: of the retrieval, of a scorer, or made of another final score."""
+
+    name: str
+    scorers: tuple[str, ...] = ()  # names of those that take part, the main one first; none = retrieval alone
+    base: str = ""  # name of the final score that this one is made of, by `step`; "" = of retrieval or a scorer
+    step: "Fusion | FrameCorrelation | DriveFilter | None" = None
+
+
+def final_scores(
+    scorers: Sequence[str],
+    fused: Mapping[str, Fusion],
+    correlated: Mapping[str, FrameCorrelation],
+    sequences: "Mapping[str, Sequence[DriveFilter]]",
+) -> dict[str, FinalScore]:
+    """Final scores of a system by name, those that are made of other ones behind them; see `mfvpr.System`."""
+    scores = [FinalScore(RETRIEVAL), *(FinalScore(name, (name,)) for name in scorers)]
+    for name, fusion in fused.items():
+        fusion.check(name, scorers)
+        scores.append(FinalScore(fusion.system(name), tuple(fusion.members(name)), name, fusion))
+    known = {score.name: score.scorers for score in scores[1:]}
+    steps = [("correlated", name, FRAMES, correlation) for name, correlation in correlated.items()]
+    for name, filters in sequences.items():
+        steps += [("sequences", name, each.name, each) for each in filters]
+    for field_name, name, words, step in steps:
+        if name not in known:
+            names = ", ".join(known) or "there are none"
+            raise InputError(f"{field_name}: expected names of scorers ({names}), got {name}")
+        scores.append(FinalScore(f"{name} + {words}", known[name], name, step))
+    by_name = {score.name: score for score in scores}
+    if len(by_name) < len(scores):
+        twice = next(score.name for score in scores if by_name[score.name] is not score)
+        raise InputError(f"scorers: {twice} is the name of another system; choose another one")
+    return by_name
+
+
+def rank_by_scores(
+    candidates: Shortlist,
+    scores: Mapping[str, Scores],
+    final_scores: Collection[FinalScore],
+    ties: Ties,
+    *,
+    num_rows: int = 0,
+    excluded: Bool[np.ndarray, "queries database"] | None = None,
+) -> dict[str, Ranked]:
+    """Rankings of queries by name of the final score, in the order of `final_scores`; a drive if it is a sequence.
+
+    `scores` `[Q, C]` are by name of the scorer. Sequences need `num_rows`, the number of images in the database, and
+    the images of it that are `excluded` for each query.
+    """
+    known = {RETRIEVAL: candidates.scores, **scores}
+    rankings: dict[str, Ranked] = {}
+    for score in final_scores:
+        if isinstance(score.step, Fusion):
+            known[score.name] = score.step(score.base, candidates, known)
+        elif isinstance(score.step, FrameCorrelation):
+            known[score.name] = score.step(candidates, known[score.base])
+        elif score.step is not None:  # of a drive
+            rankings[score.name] = score.step(rankings[score.base], num_rows, excluded)
+            continue
+        rankings[score.name] = Ranked.of(candidates, known[score.name], ties)
+    return rankings
+
+
+def balancing_c(
+    retrieval_scores: Num[Array, " candidates"],
+    rerank_scores: Num[Array, " candidates"],
+    mask: Bool[Array, " candidates"],
+) -> Float[jax.Array, ""]:
+    """The c with which both scores of one query's candidates have the same standard deviation, in any unit.
+
+        mfvpr.balancing_c(shortlist.scores[0], scores[0], shortlist.mask[0])
+
+    Candidates count if `mask` is True, and both `retrieval_scores` and `rerank_scores` are finite.
+    """
+    both, pair = mask & jnp.isfinite(retrieval_scores) & jnp.isfinite(rerank_scores), (retrieval_scores, rerank_scores)
+    retrieval_deviation, deviation = (_masked_std(at_least_32_bits(scores), both) for scores in pair)
+    c = deviation / jnp.where(retrieval_deviation > 0, retrieval_deviation, 1.0)
+    return jnp.where((retrieval_deviation > 0) & jnp.isfinite(c), c, 0.0)
+
+
+@compiled
+def fuse(
+    retrieval_scores: AnyScores, scores: AnyScores, mask: Bool[Array, "queries candidates"], c: float | Array | None
+) -> Float[jax.Array, "queries candidates"]:
+    """Combined scores of several queries, NaN without a candidate; None as `c` is `balancing_c` of each query."""
+    if c is None:
+        c = jax.vmap(balancing_c)(retrieval_scores, scores, mask)[:, None]
+    combined = combine(masked(retrieval_scores, mask), masked(scores, mask), c=c)
+    return jnp.where(mask, combined, jnp.nan)
+
+
+def fuse_shortlist(
+    candidates: Shortlist, scores: Scores, c: float | None, *, retrieval_score: RetrievalScore = "cosine"
+) -> Scores:
+    """Combined scores of retrieval and re-ranking, see `fuse`."""
+    return np.asarray(fuse(retrieval_scores(candidates, retrieval_score), scores, candidates.mask, c))
+
+
+def retrieval_scores(candidates: Shortlist, kind: RetrievalScore = "cosine") -> Scores:
+    """Retrieval scores: cosine similarity, or minus the Euclidean distance, for scores up to 1 only."""
+    require_word("retrieval_score", kind, RetrievalScore)
+    cosine = candidates.scores
+    if kind == "cosine":
+        return cosine
+    if (largest := np.max(cosine, initial=0, where=candidates.mask)) > 1 + 1e-3:
+        raise InputError(
+            f"retrieval_score=negative_euclidean: expected cosine similarities up to 1, got {largest:.4g}; use cosine, "
+            "which takes any score"
+        )
+    return -np.sqrt(np.maximum(2 - 2 * cosine, 0))
+
+
+@compiled
+def fuse_scales(
+    scores: Num[Array, "*batch candidates scales"],
+    mask: Bool[Array, "... candidates"],
+    weights: Num[Array, " scales"] | None = None,
+) -> Float[jax.Array, "*batch candidates"]:
+    """Weighted sum of the scores of S scales or scorers; NaN without a candidate. `weights` are 1 by default.
+
+    Patch-NetVLAD fuses patch sizes in this way. Each scale first gets mean 0 and standard deviation 1 over the query's
+    candidates, or 0 if all scores are equal. A score that is not finite is left out of mean and deviation, and affects
+    only the sum of its own candidate.
+    """
+    scores = at_least_single(scores)
+    weights = jnp.ones(scores.shape[-1]) if weights is None else jnp.asarray(weights)
+    mask = jnp.broadcast_to(mask, scores.shape[:-1])
+    standardize = jnp.vectorize(_standardize, signature="(c),(c)->(c)")
+    scores = jnp.moveaxis(standardize(jnp.moveaxis(scores, -1, -2), mask[..., None, :]), -2, -1)
+    counts = jnp.expand_dims(weights != 0, tuple(range(scores.ndim - 1)))
+    scores = jnp.where(mask[..., None] & counts, scores, 0.0)  # infinity times 0 would be NaN
+    fused = jnp.matmul(scores, weights.astype(scores.dtype), precision=jax.lax.Precision.HIGHEST)
+    return jnp.where(mask, fused, jnp.nan)
+
+
+def _standardize(scores: Float[Array, " candidates"], mask: Bool[Array, " candidates"]) -> Array:
+    """Scores with mean 0 and standard deviation 1 over the finite scores of candidates."""
+    finite = mask & jnp.isfinite(scores)
+    # Relative to the maximum, equal scores deviate by exactly 0, without rounding.
+    maximum = jnp.max(masked(scores, finite, -jnp.inf), initial=-jnp.inf)
+    values = masked(scores - jnp.where(jnp.isfinite(maximum), maximum, 0.0), finite)
+    largest = jnp.max(jnp.abs(values), initial=0.0)  # its square may overflow
+    values = values / jnp.where((largest > 0) & jnp.isfinite(largest), largest, 1.0)
+    mean, deviation = masked_mean(values, finite), _masked_std(values, finite)
+    return jnp.where(finite, (values - mean) / jnp.where(deviation > 0, deviation, 1.0), scores)
+
+
+def rank_shortlist(
+    candidates: Shortlist, scores: Scores, *, ties: Ties = "retrieval"
+) -> Int[np.ndarray, "queries candidates"]:
+    """Positions into the shortlist, best first, missing candidates last; ties by retrieval or by database index."""
+    require_word("ties", ties, Ties)
+    tie_break = candidates.indices if ties == "index" else None
+    return np.asarray(rank(scores, candidates.mask, tie_break=tie_break))
+
+
 def _masked_std(values: Float[Array, "*shape"], mask: Bool[Array, "*shape"]) -> Float[jax.Array, ""]:
     """Standard deviation of all real entries, with a gradient of 0 where it is 0; 0 where there are none."""
     values, mask = values.reshape(-1), mask.reshape(-1)
     return safe_sqrt(masked_mean(masked(values - masked_mean(values, mask), mask) ** 2, mask))
-
-
-def _or_nan(values: Num[Array, "*shape"], mask: Bool[Array, "..."]) -> Float[jax.Array, "*shape"]:
-    """`values` where `mask`, NaN elsewhere."""
-    if is_concrete((values, mask)):  # `jax_debug_nans` would stop at a NaN from a compiled program
-        return jax.device_put(np.where(mask, values, np.nan))
-    return jnp.where(mask, values, jnp.nan)

@@ -1,4 +1,4 @@
-"""The stages of re-ranking a data set: match, score in batches on all devices, explain. `fusion` fuses and ranks.
+"""The stages of re-ranking a data set: match, score in batches on all devices, explain. `rankings` fuses and ranks.
 
 Files and threads stay on the host; each computation is one compiled program per shape.
 """
@@ -30,7 +30,7 @@ from mfvpr.core.scorer import (
 from mfvpr.core.types import Array, Matches, Shortlist
 from mfvpr.core.weights import match_weights
 from mfvpr.evaluation.rankings import Scores, fuse_scales
-from mfvpr.features.feature_set import FeatureSet, memory_budget
+from mfvpr.features.feature_set import memory_budget
 from mfvpr.matchers import batched_matching as batched
 from mfvpr.matchers import host_matcher as host
 from mfvpr.matchers.host_matcher import PairSource, Side
@@ -40,6 +40,13 @@ from mfvpr.storage.cache_files import MatchStore
 from mfvpr.utils.errors import InputError
 from mfvpr.utils.numerics import Device, at_least_single, available_cpus, compiled, device_of, knows_own_context
 from mfvpr.utils.runtime import DEFAULT_RUNTIME, Runtime, ordered_map
+
+SHIFTS_AT_ONCE = 64  # pairs
+STORE_BATCH = 8  # queries whose matches may be lost when a run is killed
+# Half the width of the 95 % interval of a shift if all votes agree, as a share of the image's longer side: near and
+# far things move differently, and matches on one wall err together. Chosen on the synthetic street of seed 0.
+SHIFT_FLOOR = 0.03
+WORKER_MEMORY = 2.0  # GB, as several workers may share a machine
 
 PaddedBatch = tuple[Int[np.ndarray, " _"], Matches]  # positions of its pairs, and their Matches [P, K, ...]
 
@@ -66,15 +73,10 @@ def score(
     parts = [range(start, min(start + size, num_queries)) for start in range(0, num_queries, size)]
     fitted = with_static_functions(fit_capacities(dict(scorers), *match_set.image_sizes, multiple=BIN_STEP))
     scores = {name: np.zeros((len(sets), *candidates.mask.shape), np.float32) for name in scorers}
-
-    def score_parts() -> Iterator[tuple[range, np.ndarray, dict[str, np.ndarray]]]:
-        for part in parts:
-            part_batches = all_batches(match_set, part, settings=1)
-            for places, values in run_batches(_score_all, (fitted,), part_batches, devices=runtime.devices):
-                yield part, places, values
-
     total = sum(len(partition(scale_set, part, settings=1)) for scale_set in sets for part in parts)
-    for part, places, values in runtime.progress("scores")(score_parts(), total):
+    run = partial(run_batches, _score_all, (fitted,), devices=runtime.devices)
+    scored = ((part, *batch) for part in parts for batch in run(all_batches(match_set, part, settings=1)))
+    for part, places, values in runtime.progress("scores")(scored, total):
         scale, query, place = np.unravel_index(places, (len(sets), len(part), candidates.mask.shape[1]))
         for name, pair_scores in values.items():
             scores[name][scale, part.start + query, place] = pair_scores
@@ -127,7 +129,7 @@ def fuse_all(
     if not isinstance(match_set, Scales):
         return scores[0]
     weights = None if match_set.weights is None else np.asarray(match_set.weights, np.float32)
-    return np.asarray(fuse_scales(np.moveaxis(scores, 0, -1), mask, weights, normalize=match_set.normalize))
+    return np.asarray(fuse_scales(np.moveaxis(scores, 0, -1), mask, weights))
 
 
 def _score_all(matches: Matches, scorers: dict[str, Scorer]) -> dict[str, Array]:
@@ -142,17 +144,6 @@ def _in_jax(matches: Matches, scorers: dict[str, Scorer]) -> dict[str, Array]:
     for name, values in scores.items():
         require_scores(name, values, len(matches.mask))
     return scores
-
-
-__all__ = ["Explanation", "FeatureSet", "MatchSet", "Scales", "explain", "match", "score", "stored_matches"]
-
-SHIFTS_AT_ONCE = 64  # pairs
-STORE_BATCH = 8  # queries whose matches may be lost when a run is killed
-# Half the width of the 95 % interval of a shift if all votes agree, as a share of the image's longer side: near and
-# far things move differently, and matches on one wall err together. Chosen on the synthetic street of seed 0.
-SHIFT_FLOOR = 0.03
-WORKER_MEMORY = 2.0  # GB, as several workers may share a machine
-Limits = tuple[float | None, Sequence[Device] | None]  # of memory, GB, and devices
 
 
 def match(
@@ -177,17 +168,13 @@ def match(
     Raises:
         InputError: the two sides' descriptors have different lengths, or the disk cannot be used.
     """
-    if isinstance(queries, FeatureSet) and isinstance(database, FeatureSet):
-        is_known = (queries.counts > 0).any() and (database.counts > 0).any()
-        if is_known and queries.dimension != database.dimension:
-            got = f"{queries.dimension} and {database.dimension} (database); extract all images alike"
-            raise InputError(f"features: expected as many dimensions on both sides, got {got}")
     is_on_host = isinstance(matcher, PairSource)
-    runtime = replace(runtime, cluster=None) if store is None or is_on_host else runtime
-    limits = runtime.memory, runtime.devices
+    if store is None or is_on_host:
+        runtime = replace(runtime, cluster=None)
+    memory, devices = runtime.memory, runtime.devices
     if runtime.cluster is not None:
-        limits = runtime.memory or WORKER_MEMORY, None
-    shared = queries, database, candidates, matcher, limits
+        memory, devices = runtime.memory or WORKER_MEMORY, None
+    shared = queries, database, candidates, matcher, memory, devices
     if store is None:
         results = runtime.map(_match_queries, shared, range(len(queries)), "matching", batched.QUERIES)
         matched = [query for _, query in results]
@@ -209,13 +196,19 @@ def match(
 
 
 def _match_queries(
-    queries: Any, database: Any, candidates: Shortlist, matcher: Any, limits: Limits, rows: Sequence[int]
+    queries: Any,
+    database: Any,
+    candidates: Shortlist,
+    matcher: Any,
+    memory: float | None,
+    devices: Sequence[Device] | None,
+    rows: Sequence[int],
 ) -> Iterator[tuple[int, QueryMatches]]:
-    """(row, matches) of queries, in the order of `rows`, within limits of memory and devices."""
-    sides, (memory, devices) = (queries, database, candidates), limits
+    """(row, matches) of queries, in the order of `rows`, within limits of memory (GB) and devices."""
     if isinstance(matcher, PairSource):
-        return host.match_queries(*sides, rows, matcher)
-    return batched.match_queries(*sides, rows, matcher, memory=memory, devices=devices or [device_of(())])
+        return host.match_queries(queries, database, candidates, rows, matcher)
+    devices = devices or [device_of(())]
+    return batched.match_queries(queries, database, candidates, rows, matcher, memory=memory, devices=devices)
 
 
 def stored_matches(store: MatchStore, *, memory: float | None = None) -> tuple[MatchSet, Shortlist] | None:
@@ -287,31 +280,20 @@ def dominant_shifts(
     return shifts, intervals, sizes
 
 
+@compiled
 def pair_shifts(
     scorer: HistogramOfShifts, matches: Matches
-) -> tuple[Float[np.ndarray, "pairs 2"], Float[np.ndarray, "pairs 2 2"]]:
+) -> tuple[Float[Array, "pairs 2"], Float[Array, "pairs 2 2"]]:
     """`dominant_shifts` of matches `[P, K, ...]`, by a scorer with the capacity for their images."""
-    votes, *values = jax.tree.map(np.array, _pair_shifts(scorer, matches))
-    for of_pairs in values:  # the host makes the NaN: `jax_debug_nans` stops at those of programs
-        of_pairs[~votes] = np.nan
-    shifts, intervals = values
-    return shifts, intervals
 
-
-@compiled
-def _pair_shifts(scorer: HistogramOfShifts, matches: Matches) -> tuple[Array, Array, Array]:
-    """Whether any match votes `[P]`, and `pair_shifts`, 0 without votes."""
-
-    def of_pair(pair: Matches) -> tuple[Array, Array, Array]:
-        votes = scorer(pair) > 0
+    def of_pair(pair: Matches) -> tuple[Array, Array]:
         shifts = jnp.concatenate([scorer.dominant_shift(pair, refine=True)[None], scorer.shift_interval(pair)])
         if scorer.direction == "query_minus_candidate":
             shifts = -shifts[jnp.array([0, 2, 1])]
-        shifts = jnp.where(votes, shifts, 0.0)
-        shift, low, high = shifts
+        shift, low, high = jnp.where(scorer(pair) > 0, shifts, jnp.nan)
         floor = SHIFT_FLOOR * at_least_single(pair.image_size0).max()
         half = jnp.sqrt(((high - low) / 2) ** 2 + floor**2)
-        return votes, shift, (low + high)[None] / 2 + jnp.stack([-half, half])
+        return shift, (low + high)[None] / 2 + jnp.stack([-half, half])
 
     return jax.vmap(of_pair)(matches)
 

@@ -22,7 +22,7 @@ class PathTest(NamedTuple):
     """Two systems on the same queries along a path, see `path_test`."""
 
     design_effect: float  # so many neighboring queries count as one; 1 = independent
-    p_value: float  # probability of a difference at least this large if neither were better
+    p_value: float
 
 
 class Estimate(NamedTuple):
@@ -37,41 +37,33 @@ def estimate(hits: Bool[np.ndarray, " queries"]) -> Estimate:
     return Estimate(float(np.mean(hits)), recall_interval(hits))
 
 
-def recall_interval(hits: np.ndarray, *, level: float = 0.95) -> tuple[float, float]:
-    """Confidence interval of the recall of queries along a path, which succeed and fail together with their neighbors.
+def recall_interval(hits: np.ndarray) -> tuple[float, float]:
+    """95 % confidence interval of the recall of hits `[Q]` bool along a path, where neighbors fail together.
 
-    The interval of Clopper and Pearson (1934) for the effective number of independent queries, Q / `design_effect`. If
-    the path is worth few independent queries, the data do not support an interval, and it is nearly [0, 1]. Only hits
-    give a lower end of 18 % with 101 queries, 43 % with 300, and 69 % with 1,000.
-
-    In simulations with recalls of 0.5 to 0.95 and autocorrelations of the hits up to 0.9 from query to query, the 95 %
-    interval covers the recall in at least 90 %. It covers less if noise of single queries hides a slow change.
-
-    Hits `[Q]` are bool, in the order of the path. The interval is (0, 1) without queries.
+    The interval of Clopper and Pearson (1934) for the effective number of independent queries, Q / `design_effect`. It
+    is nearly [0, 1] if the path is worth few, and (0, 1) without queries. In simulations with recalls of 0.5 to 0.95
+    and autocorrelations of the hits up to 0.9, it covers the recall in at least 90 %, and in less if noise of single
+    queries hides a slow change.
     """
     hits = np.asarray(hits, bool)
     if hits.ndim != 1:
         raise InputError(f"hits: expected [Q], one of every query, got {list(hits.shape)}; call it for each row")
-    if not 0 < level < 1:
-        raise InputError(f"level={level}: expected a number between 0 and 1, such as 0.95")
     if len(hits) == 0:
         return 0.0, 1.0
     effective = len(hits) / design_effect(hits)
     correct = hits.mean() * effective
-    incorrect, tail = effective - correct, (1 - level) / 2
-    low = special.betaincinv(correct, incorrect + 1, tail) if correct > 0 else 0.0
-    high = special.betaincinv(correct + 1, incorrect, 1 - tail) if incorrect > 0 else 1.0
+    incorrect = effective - correct
+    low = special.betaincinv(correct, incorrect + 1, 0.025) if correct > 0 else 0.0
+    high = special.betaincinv(correct + 1, incorrect, 0.975) if incorrect > 0 else 1.0
     return float(low), float(high)
 
 
 def design_effect(hits: np.ndarray) -> float:
     """So many neighboring queries of a path count as one, in 1 ... Q (1 = independent), from hits `[Q]` bool.
 
-    This is the variance of the mean divided by the variance for independent queries. It is estimated twice, as in a
-    Markov chain with the autocorrelation of neighboring queries, and of neighboring blocks of sqrt(Q) queries, since
-    noise of single queries hides slow changes; the larger estimate counts. A path of only hits or only misses shows no
-    autocorrelation, and few hits or misses show little. The result is therefore (w estimate + 10 Q^(1/3)) / (w + 1)
-    with w = (n / estimate)^3 / 6 for n hits or misses, the rarer. These numbers were chosen by simulation.
+    This is the variance of the mean divided by that for independent queries, estimated from the autocorrelation. Few
+    hits or misses show little of that. The result is therefore (w estimate + 10 Q^(1/3)) / (w + 1) with
+    w = (n / estimate)^3 / 6 for n hits or misses, the rarer. These numbers were chosen by simulation.
     """
     hits = np.asarray(hits, np.float64)
     estimate = _variance_ratio(hits)
@@ -93,14 +85,11 @@ def path_test(first: np.ndarray, second: np.ndarray) -> PathTest:
     """Test of two systems' hits `[Q]` bool along a path: `mcnemar` for the effective number of independent queries.
 
     The numbers of queries for which only one is correct are divided by the largest `design_effect` of the first hits,
-    the second hits, and their differences: noise of one system hides slow changes of the other in the differences.
+    the second hits, and their differences: noise of one system hides slow changes of the other in the differences. In
+    simulations of equally good systems with autocorrelations of the hits up to 0.9, p is at most 5 % in at most 5 %
+    (`mcnemar`: in up to 89 %), and in more if noise of single queries hides a slow change.
 
-    In simulations of equally good systems with recalls of 0.5 and 0.8, 101 to 1,000 queries, and autocorrelations of
-    the hits up to 0.9 in one or both, p is at most 5 % in at most 5 % (`mcnemar`: in up to 89 %). It is in more if
-    noise of single queries hides a slow change. Differences are found late: of independent queries, 300 suffice to
-    find in two of three cases that a recall is 0.9 and not 0.8; with correlated ones, more.
-
-    The hits are in the order of the path; of several drives, in the order of the places.
+    Sort the queries of several drives by their places.
     """
     first, second = np.asarray(first, bool), np.asarray(second, bool)
     if first.ndim != 1 or first.shape != second.shape:
@@ -116,7 +105,11 @@ def _coin_p_value(heads: float, tails: float) -> float:
 
 
 def _variance_ratio(values: np.ndarray) -> float:
-    """The design effect of values `[Q]` from the autocorrelation of neighbors, in 1 ... Q, see `design_effect`."""
+    """The design effect of values `[Q]`, in 1 ... Q, as in a Markov chain.
+
+    It is the larger one by the autocorrelation of neighboring queries, and of neighboring blocks of sqrt(Q) queries:
+    noise of single queries hides slow changes.
+    """
     total, ratio = len(values), 1.0
     if total <= 3:
         return ratio

@@ -12,18 +12,13 @@ from jaxtyping import UInt8
 
 from mfvpr.baselines.scorers import SCORERS
 from mfvpr.core.scorer import Scorer, check_bounds
-from mfvpr.core.types import Shortlist
 from mfvpr.datasets.datasets import Dataset, ImageFolder
-from mfvpr.datasets.image_reading import read_size, resize, shape_size
-from mfvpr.evaluation import stages
+from mfvpr.datasets.image_reading import read_size, shape_size
 from mfvpr.evaluation.drives import DriveFilter
-from mfvpr.evaluation.fusion import FinalScore, FrameCorrelation, Fusion, final_scores
-from mfvpr.evaluation.rankings import RETRIEVAL, Ties
+from mfvpr.evaluation.rankings import RETRIEVAL, FinalScore, FrameCorrelation, Fusion, Ties, final_scores
 from mfvpr.features.extractor import Extractor, Scale, Source
-from mfvpr.features.feature_set import FeatureSet
 from mfvpr.features.sift import Sift
 from mfvpr.matchers.host_matcher import PairSource
-from mfvpr.matchers.match_set import Scales
 from mfvpr.matchers.matcher import NEIGHBORS, LightGlueMatcher, Matcher
 from mfvpr.retrieval.retriever import Retriever, with_parts
 from mfvpr.utils.errors import InputError, require_word
@@ -69,17 +64,14 @@ class Pipeline:
             name = type(self.extractor).__name__
             raise InputError(f"{name}: gives no local features; expected an extractor that does")
         if isinstance(self.matcher, type) or not (callable(self.matcher) or isinstance(self.matcher, PairSource)):
-            got = f"the class {self.matcher.__name__}" if isinstance(self.matcher, type) else repr(self.matcher)
             expected = "a function of the features of two images that returns Matches"
-            raise InputError(f"matcher: expected {expected}, got {got}; see mfvpr.Matcher")
+            raise InputError(f"matcher: expected {expected}, got {self.matcher!r}; see mfvpr.Matcher")
         if isinstance(self.matcher, LightGlueMatcher):
             dimensions = [scale.dimension for scale in self.extractor.scales if scale.dimension]  # 0 = not known
             if isinstance(self.extractor, Sift) or {*dimensions} - {self.matcher.dimension}:
                 got = f"{type(self.extractor).__name__} of {', '.join(map(str, dimensions))}"
                 expected = f"ALIKED's features, of {self.matcher.dimension} dimensions"
-                raise InputError(
-                    f"LightGlue: expected {expected}, got {got}; extract these, or match nearest neighbors"
-                )
+                raise InputError(f"LightGlue: expected {expected}, got {got}; match nearest neighbors instead")
 
     @property
     def image_source(self) -> PairSource | None:
@@ -92,16 +84,12 @@ class Pipeline:
         """Scales of the matches."""
         return self.extractor.scales if self.image_source is None else (Scale(0, _TYPICAL_MATCHES),)
 
-    def image_size_for(self, shape: tuple[int, int]) -> tuple[int, int]:
-        """Size of about `pixels` in the shape of an image of `shape`, both (width, height)."""
-        assert self.pixels is not None
-        return shape_size(shape, self.pixels, getattr(self.extractor, "side_multiple", 1))
-
     def size_for_images(self, folders: Iterable[ImageFolder], note: Note) -> tuple[int, int]:
-        """The image size for the shape of the first image, by `image_size_for`.
+        """The image size (width, height) of about `pixels` in the shape of the first image.
 
         `note` gets a line if images have another aspect ratio. Images that cannot be read do not count.
         """
+        assert self.pixels is not None
         shapes = {}
         for folder in folders:
             for path in folder.paths:
@@ -110,7 +98,8 @@ class Pipeline:
         if not shapes:
             raise InputError("image_size: expected images to take the shape from, got none that can be read")
         first = next(iter(shapes.values()))
-        size, aspect = self.image_size_for(first), first[0] / first[1]
+        size = shape_size(first, self.pixels, getattr(self.extractor, "side_multiple", 1))
+        aspect = first[0] / first[1]
         other = [path for path, shape in shapes.items() if abs(shape[0] / shape[1] / aspect - 1) > _SAME_ASPECT]
         if other:
             got = f"{len(other)} of {len(shapes)} have another aspect ratio than the first, such as {other[0]}"
@@ -155,6 +144,9 @@ class System:
     def __post_init__(self) -> None:
         """Raise an InputError for scorers out of their bounds, or names that are taken or unknown."""
         require_word("ties", self.ties, Ties)
+        for name, filters in self.sequences.items():
+            if not isinstance(filters, list | tuple) or not all(isinstance(each, DriveFilter) for each in filters):
+                raise InputError(f"sequences: expected a list of DriveFilter(...) for {name}, got {filters!r}")
         if self.headline not in self.final_scores:
             raise InputError(f"final={self.final!r}: expected one of {', '.join(self.final_scores)}")
         if isinstance(self.final_scores[self.headline].step, DriveFilter):
@@ -190,37 +182,6 @@ class System:
         if self.pipeline.pixels is None:
             return self
         return self.with_image_size(self.pipeline.size_for_images(folders, note))
-
-    def warm_up(self, image_size: tuple[int, int]) -> None:
-        """Compile extractor, matcher and scorers for a query with its candidates, on a made-up image.
-
-        `image_size` is (width, height) px, before images are resized to the size of the extractor. Images with other
-        numbers of features may compile a few more programs, and so does a map: see `Map.warm_up`. An extractor that
-        reads features raises an `InputError`.
-        """
-        pipeline = self.pipeline
-        if pipeline.pixels is not None:
-            pipeline = pipeline.with_image_size(pipeline.image_size_for(image_size))
-        extractor, candidates = pipeline.extractor, pipeline.candidates
-        if isinstance(extractor, Source):
-            raise InputError(f"{type(extractor).__name__}: expected an extractor of images, got a reader of features")
-        if pipeline.image_source is not None:
-            raise InputError(f"{type(pipeline.matcher).__name__}: expected a matcher of features, got one of images")
-        rows = np.arange(1 if candidates == "all" else candidates, dtype=np.int32)[None]
-        shortlist = Shortlist(rows, np.zeros(rows.shape, np.float32), rows >= 0)
-        image = resize(noise_images(image_size)[0], extractor.image_size, extractor.interpolation)
-        [description] = extractor(image[None])
-        matches = tuple(
-            stages.match(
-                FeatureSet.of([scale], unit_length=False),
-                FeatureSet.of([scale] * rows.size, unit_length=False),
-                shortlist,
-                pipeline.matcher,
-            )
-            for scale in description.local
-        )
-        weights = tuple(scale.weight for scale in extractor.scales)
-        stages.score(self.scorers, matches[0] if len(matches) == 1 else Scales(matches, weights), shortlist)
 
 
 def folders_of(dataset: Dataset) -> list[ImageFolder]:

@@ -37,8 +37,7 @@ from mfvpr.evaluation.evidence import (
     reason_against,
     reason_against_image,
 )
-from mfvpr.evaluation.fusion import rank_by_scores
-from mfvpr.evaluation.rankings import Ranked
+from mfvpr.evaluation.rankings import Ranked, rank_by_scores
 from mfvpr.evaluation.stages import pair_shifts, require_finite
 from mfvpr.evaluation.system import System, noise_images
 from mfvpr.features.feature_set import STEP, stack_features, strength

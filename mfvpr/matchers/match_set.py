@@ -5,7 +5,6 @@ import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Literal
 
 import numpy as np
 from jaxtyping import Float, Int, Num
@@ -24,7 +23,6 @@ BYTES_PER_SLOT = 41
 BLOCK_BYTES = 2**28
 
 Row = Mapping[str, np.ndarray]  # matches [n, ...] by field
-Normalize = Literal["zscore", "none"]
 
 
 @dataclass(frozen=True)
@@ -124,12 +122,10 @@ class Scales:
     Attributes:
         match_sets: S match sets of the same queries and candidates.
         weights: of the scales; None = 1 each.
-        normalize: normalization of the scores of a scale before fusion.
     """
 
     match_sets: Sequence[MatchSet]
     weights: Sequence[float] | None = None
-    normalize: Normalize = "zscore"
 
     @property
     def image_sizes(self) -> tuple[Num[np.ndarray, "pairs 2"], Num[np.ndarray, "pairs 2"]]:

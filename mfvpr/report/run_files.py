@@ -13,11 +13,10 @@ from mfvpr.datasets.contents import Contents, fingerprints, readings
 from mfvpr.datasets.positives import stack_positives
 from mfvpr.datasets.published import published_differences
 from mfvpr.evaluation.confidence import write_confidences
+from mfvpr.evaluation.dataset_ranking import num_candidates
 from mfvpr.evaluation.drives import DriveFilter
-from mfvpr.evaluation.fusion import Fusion
 from mfvpr.evaluation.protocol import places_along_path
-from mfvpr.evaluation.rankings import Ranked
-from mfvpr.evaluation.sequence_matching import num_candidates
+from mfvpr.evaluation.rankings import Fusion, Ranked
 from mfvpr.evaluation.stages import Scales, dominant_shifts
 from mfvpr.evaluation.statistics import mcnemar, path_test
 from mfvpr.report.evaluations import NO_PLACE, EvaluationReport, confidence_table, recall_table

@@ -154,7 +154,7 @@ def sweep_json(outcome: Outcome) -> dict[str, Any]:
         report.append(verdict._asdict() | parts)
     values = {
         "axes": axes_json(outcome.axes),
-        "own": dict(outcome.axes.own),
+        "own": dict(outcome.axes.own_values),
         "search": "grid" if outcome.is_grid else "optuna",
         "unit": protocol.unit,
         "thresholds": list(protocol.thresholds),
@@ -223,7 +223,7 @@ def _heat_map(outcome: Outcome, first: str, second: str) -> Canvas:
     panel.set(xlabel=second, ylabel=first)
     corner = best[second] - 0.5, best[first] - 0.5
     panel.add_patch(Rectangle(corner, 1, 1, linewidth=2.5, fill=False, edgecolor=MARK))
-    own = {"": ""} | {name: format_value(value) for name, value in axes.own.items()}
+    own = {"": ""} | {name: format_value(value) for name, value in axes.own_values.items()}
     if own[first] in words[first] and own[second] in words[second]:
         place = words[second].index(own[second]), words[first].index(own[first])
         panel.plot(*place, marker="o", markersize=30, markerfacecolor="none", markeredgecolor=MARK)

@@ -33,15 +33,16 @@ def random_index(rng, side, *, noise=0.4):
     return np.where(rng.random(side**2) < noise, rng.integers(0, side**2, side**2), index)
 
 
+@pytest.mark.parametrize("outside", ["unequal", "zero"])
 @pytest.mark.parametrize(("side", "patch"), [(1, 1), (2, None), (5, None), (5, 5), (8, None), (12, 3), (12, None)])
-def test_agrees_with_the_loop(side, patch):
-    scorer = GridAnchors(side, patch)
+def test_agrees_with_the_loop(side, patch, outside):
+    scorer = GridAnchors(side, patch, outside)
     for seed in range(3):
         rng = np.random.default_rng(seed)
         index = random_index(rng, side, noise=0.4 * seed)
         matched = np.ones(side**2, bool) if seed < 2 else rng.random(side**2) < 0.7
         grid = np.where(matched, index, None).reshape(side, side).tolist()
-        expected = oracles.grid_anchors(grid, side, patch=patch)
+        expected = oracles.grid_anchors(grid, side, patch=patch, outside=-1000 if outside == "unequal" else 0)
         order = rng.permutation(side**2)
         got = score(scorer, per_match(cells(index, side, matched=matched), lambda rows: rows[order]))  # noqa: B023
         assert got.dtype == np.float32

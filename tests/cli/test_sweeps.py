@@ -49,7 +49,7 @@ def test_the_best_setting_is_honestly_named(swept):
     _, result = swept
     outcome = result.outcome
     assert outcome.own == 6
-    assert outcome.axes.own == {"sigma": 10.0, "weight": "unit"}
+    assert outcome.axes.own_values == {"sigma": 10.0, "weight": "unit"}
     tuning = outcome.protocol.tuning(outcome.rows)[:, :6, 1].mean(axis=0)
     assert tuning[outcome.best] == tuning.max()
     assert result.best == outcome.settings[outcome.best]
@@ -120,7 +120,7 @@ def test_a_system_that_ranks_by_a_fused_score_is_swept_by_it(sweep):
     pipeline = mfvpr.Pipeline(sift, Retrieval(Aggregated(sift, VladFitting())))
     fused = mfvpr.System(pipeline, {"mine": MyScorer()}, {"mine": Fusion(c=30.0)}, final="mine + retrieval")
     by_system = sweep(fused, sigma=[5, 22.5])
-    assert by_system.outcome.axes.own == {"c": 30.0, "sigma": 10.0}
+    assert by_system.outcome.axes.own_values == {"c": 30.0, "sigma": 10.0}
     explicit = sweep(MyScorer(), c=[30.0], sigma=[5, 22.5])
     np.testing.assert_array_equal(by_system.outcome.rows[:, :2], explicit.outcome.rows[:, :2])
 

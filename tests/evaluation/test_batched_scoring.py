@@ -93,14 +93,12 @@ def test_scores_of_scales_are_fused_over_the_candidates_of_a_query(two_scales):
         assert fused[name].dtype == np.float32
         for query in range(QUERIES):
             scores = np.stack([scale_scores[name][query] for scale_scores in by_scale], axis=-1)
-            expected = oracles.fuse_scales(scores, candidates.mask[query], WEIGHTS, "zscore")
+            expected = oracles.fuse_scales(scores, candidates.mask[query], WEIGHTS)
             np.testing.assert_allclose(fused[name][query], expected, rtol=1e-4, atol=1e-5)
 
 
-@pytest.mark.parametrize("normalize", ["zscore", "none"])
-def test_sweeps_fuse_scales_over_the_ranked_candidates(two_scales, normalize, tmp_path):
+def test_sweeps_fuse_scales_over_the_ranked_candidates(two_scales, tmp_path):
     scales, candidates = two_scales
-    scales = replace(scales, normalize=normalize)
     view = np.random.default_rng(1).random(candidates.mask.shape) < 0.7
     settings = sweeps.grid({"mean": ["unweighted", "median"], "c": [None, 0.5]})
     got = rank(
@@ -114,14 +112,3 @@ def test_sweeps_fuse_scales_over_the_ranked_candidates(two_scales, normalize, tm
             order = rankings.rank_shortlist(listed, rankings.fuse_shortlist(listed, scores, setting["c"]))
             indices = np.where(seen, candidates.indices, -1)
             np.testing.assert_array_equal(rows, np.take_along_axis(indices, order, axis=1))
-
-
-def test_scales_of_other_queries_or_weights_raise(data):
-    match_set, _ = data
-    for words, *arguments in (
-        (r"queries and candidates, got \[\(2, 5", [match_set, match_set.take(range(2))]),
-        (r"weight .*2 scales, got 1", [match_set] * 2, [1.0]),
-        ("expected match sets", []),
-    ):
-        with pytest.raises(mfvpr.InputError, match=words):
-            Scales(*arguments)

@@ -10,8 +10,8 @@ import pytest
 
 import mfvpr
 from mfvpr import datasets
-from mfvpr.datasets import IndexFile, Positives
-from mfvpr.evaluation import Fusion, confidence_inputs, fit_confidence, halves, match_sequence
+from mfvpr.datasets import IndexFile
+from mfvpr.evaluation import Fusion, match_sequence
 from mfvpr.evaluation.dataset_ranking import KS
 from mfvpr.evaluation.statistics import path_test
 from mfvpr.features import Aggregated, Sift, VladFitting
@@ -19,10 +19,10 @@ from mfvpr.io import write_features, write_global_descriptors, write_shortlist
 from mfvpr.report.evaluations import EvaluationReport, recall_table
 from mfvpr.report.run_files import write_gains
 from mfvpr.report.tables import read_table
-from mfvpr.retrieval import DescriptorFiles, FeatureFiles, Retrieval, ShortlistFiles, WhitenedSearch
+from mfvpr.retrieval import DescriptorFiles, FeatureFiles, Retrieval, ShortlistFiles
 from mfvpr.retrieval.precomputed import File
 from mfvpr.storage import FeatureCache
-from mfvpr.utils import InputError, runtime
+from mfvpr.utils import runtime
 from mfvpr.utils.fingerprints import fingerprint
 from tests.builders import evaluate_parts
 from tests.programs import typed
@@ -62,7 +62,7 @@ def test_systems_and_their_recall(dataset, result):
     assert result.recall([])["histogram"].by_sequence.shape == (1, 0, len(KS))
 
 
-def test_sequences_are_evaluated_by_themselves_with_their_means(several, split, small_street, result, tmp_path):
+def test_sequences_are_evaluated_by_themselves_with_their_means(several, result, tmp_path):
     parts = evaluate_parts(several, SIFT, VLAD, SCORERS, candidates=5, final="count")
     [joint] = result.systems["count"]
     rows = np.concatenate([ranked.rows for ranked in parts.systems["count"]])
@@ -86,24 +86,6 @@ def test_sequences_are_evaluated_by_themselves_with_their_means(several, split, 
     for first, second, only_first, _, _, *path in read_table(tmp_path / "differences.csv").rows:
         assert int(only_first) == (hits[first] > hits[second]).sum()
         assert [float(value) for value in path] == pytest.approx(path_test(hits[first], hits[second]), rel=1e-6)
-    with pytest.raises(InputError, match=r"one query sequence, got 2; .*first, second"):
-        several.queries  # noqa: B018
-    with pytest.raises(InputError, match=r"queries: expected folders of different names.* got first, first"):
-        datasets.folder(small_street / "database", [split[0], split[0]], ground_truth="order")
-
-
-def test_answers_of_sequences_are_as_sure_as_those_of_one_path(dataset, several):
-    """The sequences are the two ends of a path: what p is fitted on is the other half of its places, not of each."""
-    result = evaluate_parts(several, SIFT, VLAD, SCORERS, candidates=10)
-    report = EvaluationReport(result, [0, 1], [1])
-    inputs = np.concatenate([confidence_inputs(ranked) for ranked in result.systems["count"]])
-    correct, halved = report.hits("count"), halves(dataset.truth.positives(1))
-    for half in halved:
-        fitted = fit_confidence(inputs[half.tune], correct[half.tune])
-        expected = fitted.probability(inputs[half.report])
-        assert np.isfinite(expected).all()
-        np.testing.assert_allclose(report.probabilities["count"][half.report], expected)
-    assert [len(part) for part in report.by_sequence(report.scores("count"))] == [3, 7]
 
 
 def test_only_candidates_are_extracted(dataset, tmp_path):
@@ -133,21 +115,6 @@ def test_matches_are_kept_and_read_without_features(dataset, result, tmp_path):
         [ranked], [expected] = system.systems[name], result.systems[name]
         np.testing.assert_array_equal(ranked.rows, expected.rows)
     np.testing.assert_array_equal(first.matched[0].candidates.indices, again.matched[0].candidates.indices)
-
-
-def test_whitening_is_fitted_on_the_database():
-    rng = np.random.default_rng(0)
-    database, queries = (rng.normal(size=(n, 12)).astype(np.float32) for n in (200, 5))
-    database[3] = np.nan
-    fitted = WhitenedSearch(4).fit(database)
-    usable = np.delete(database, 3, axis=0).astype(np.float64)
-    values, axes = np.linalg.eigh(np.cov(usable.T, bias=True))
-    components = axes[:, ::-1][:, :4] / np.sqrt(values[::-1][:4])
-    unit = [(side - usable.mean(axis=0)) @ components for side in (queries, usable)]
-    unit = [side / np.linalg.norm(side, axis=1, keepdims=True) for side in unit]
-    shortlist = fitted.shortlist(queries, database, 6)
-    rows = np.delete(np.arange(200), 3)[np.argsort(-(unit[0] @ unit[1].T), axis=1)[:, :6]]
-    np.testing.assert_array_equal(shortlist.indices, rows)
 
 
 @pytest.fixture(scope="module")
@@ -185,20 +152,6 @@ def test_files_of_other_programs_stand_in_for_every_stage(dataset, files, result
             np.testing.assert_allclose(got.scores, expected.scores, rtol=1e-5)
 
 
-def test_imported_shortlists_leave_out_what_is_excluded(dataset, files):
-    excluded = Positives.from_rows([[row] for row in range(10)], 10)
-    sequence = replace(dataset.only, excluded=excluded)
-    listed = ShortlistFiles({dataset.queries.root: File(files / "pairs.npz")})
-    for width in (2, 7):
-        candidates = listed.shortlist(sequence, dataset.database, width, FeatureCache()).candidates
-        assert candidates.indices.shape == (10, width)
-        assert not excluded.contains(candidates.indices).any()
-        for row, mask in zip(candidates.indices, candidates.mask, strict=True):
-            assert (row[mask] >= 0).all()
-            assert (row[~mask] == -1).all()
-            assert (np.diff(mask.astype(int)) <= 0).all()
-
-
 def test_queries_without_candidates_are_told(dataset, tmp_path):
     """Also where matches are kept from before, and nothing else is read."""
     pairs = tmp_path / "pairs.txt"
@@ -214,16 +167,6 @@ def test_queries_without_candidates_are_told(dataset, tmp_path):
         assert "0001.png: no candidates (8 such queries of 10)" in line
 
 
-def test_files_are_known_by_content(dataset, files, tmp_path):
-    def recipe(root):
-        return FeatureCache(tmp_path / "s").recipes.of_folder(dataset.database, FeatureFiles(at(dataset, root, ".npz")))
-
-    moved = Path(shutil.copytree(files, tmp_path / "elsewhere"))
-    assert recipe(moved) == recipe(files)
-    shutil.copy(files / "queries.npz", moved / "database.npz")
-    assert recipe(moved) != recipe(files)
-
-
 def test_what_is_read_of_files_is_part_of_the_recipe(dataset, files, tmp_path):
     """Which file belongs to which folder, and the prefixes; also within an aggregation."""
     feature_cache, sides = FeatureCache(tmp_path), at(dataset, files, ".npz")
@@ -232,33 +175,16 @@ def test_what_is_read_of_files_is_part_of_the_recipe(dataset, files, tmp_path):
     readers = FeatureFiles, DescriptorFiles, lambda at: Retrieval(Aggregated(FeatureFiles(at), VladFitting()))
     for read in readers:
         assert len({fingerprint(feature_cache.recipes.of(read(at))) for at in changed}) == len(changed)
-    pairs = [ShortlistFiles({folder: first}, prefix) for prefix in ("", "database/")]
-    assert len({fingerprint(feature_cache.recipes.of(shortlists)) for shortlists in pairs}) == 2
-
-
-def test_the_database_is_described_and_fitted_on_once_for_all_sequences(several, tmp_path, monkeypatch):
-    fitted, lines = [], []
-    for kind in (VladFitting, WhitenedSearch):
-        plain = kind.fit
-        monkeypatch.setattr(kind, "fit", lambda self, sample, plain=plain: fitted.append(self) or plain(self, sample))
-    whitened = replace(VLAD, search=WhitenedSearch(4))
-    runtime = mfvpr.Runtime(log=lines.append)
-    evaluate_parts(several, SIFT, whitened, SCORERS, candidates=5, cache=FeatureCache(tmp_path), runtime=runtime)
-    assert fitted == [VLAD.describer.fitting, whitened.search]
-    assert [line for line in lines if "10 of 10 images to do" in line and "database" in line] == lines[1:2]
-    assert sum("images to do" in line for line in lines) == 3
-
-
-@pytest.fixture
-def imported(small_street, files):
-    """Settings of programs that read the features of other programs."""
-    return (f"dataset.database={small_street}/database", "candidates=5", "cache=null", "features=import",
-            f"features.database={files}/database.npz", f"features.queries={files}/queries.npz",
-            "features.database_prefix=database/", "features.query_prefix=queries/")  # fmt: skip
+    moved = Path(shutil.copytree(files, tmp_path / "elsewhere"))
+    recipes = [feature_cache.recipes.of(FeatureFiles(at(dataset, root, ".npz"))) for root in (files, moved)]
+    assert recipes[0] == recipes[1]  # by content
 
 
 @pytest.mark.slow
-def test_programs_take_sequences_and_files(split, imported, tmp_path, monkeypatch, capsys):
+def test_programs_take_sequences_and_files(split, small_street, files, tmp_path, monkeypatch, capsys):
+    imported = (f"dataset.database={small_street}/database", "candidates=5", "cache=null", "features=import",
+                f"features.database={files}/database.npz", f"features.queries={files}/queries.npz",
+                "features.database_prefix=database/", "features.query_prefix=queries/")  # fmt: skip
     common = (*imported, "dataset=sequences", "dataset.ground_truth=index", "dataset.index_file=truth.csv",
               f"dataset.queries=[{split[0]},{split[1]}]", "dataset.widen_index=true", "recall.tolerances=[0,1]",
               "recall.ks=[1,5]", "retrieval=vlad", "retrieval.num_words=8", "scorer=count", "devices=all",

@@ -40,12 +40,6 @@ def test_noise_of_any_strength_is_noise(size, deviation):
     assert reason_against_image(np.repeat(gray, 3, axis=2)) == "no better than noise"
 
 
-def test_a_fence_is_no_noise():
-    image = np.zeros((320, 320, 3), np.uint8)
-    image[:, (np.arange(320) // 5) % 2 == 0] = 60
-    assert reason_against_image(image) is None
-
-
 def test_negative_detection_scores_have_no_strength():
     scores = np.array([0.5, -3.0, 0.25], np.float32)
     features = Features(np.zeros((3, 2)), np.zeros((3, 4)), scores, np.ones(3, bool), np.ones(2))

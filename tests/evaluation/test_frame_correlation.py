@@ -57,6 +57,6 @@ def test_nan_stays_nan_and_is_no_place():
 
 
 def test_numbers_without_meaning_raise():
-    for incorrect in ((0,), (1, 0.0), (1, 1.0, -0.1), (1, np.nan), (1, np.inf), (1, 1.0, np.inf)):
+    for incorrect in ((0,), (1, 0.0), (1, 1.0, -0.1), (1, np.inf)):
         with pytest.raises(InputError, match="expected at least one query"):
             FrameCorrelation(*incorrect)

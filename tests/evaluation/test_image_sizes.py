@@ -1,7 +1,6 @@
 """The image size of a pipeline that leaves it to the images."""
 
 import shutil
-from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -62,7 +61,3 @@ def test_no_image_has_no_shape(tmp_path):
     (tmp_path / "a.png").write_bytes(b"no image")
     with pytest.raises(InputError, match="expected images to take the shape from"):
         AUTO.fit_image_size([image_folder(tmp_path)], print)
-
-
-def test_a_warm_up_knows_the_shape():
-    replace(AUTO, pipeline=replace(AUTO.pipeline, candidates=1)).warm_up((64, 48))

@@ -7,8 +7,7 @@ from mfvpr import InputError, Shortlist, frame_positives
 from mfvpr.datasets import AllowedTruth, FrameTruth, LabelTruth, Positives, RadiusTruth
 from mfvpr.datasets.ground_truth import middle
 from mfvpr.evaluation import best_setting, evaluation_protocol, halves, neighboring_settings
-from mfvpr.evaluation.protocol import halves_of_map, places_along_path
-from mfvpr.evaluation.statistics import path_test
+from mfvpr.evaluation.protocol import places_along_path
 
 QUERIES, TOLERANCES, SETTINGS = 20, (0, 1, 3), 4
 TRUTH = FrameTruth(tuple((row,) for row in range(QUERIES)), QUERIES)
@@ -91,18 +90,6 @@ def test_what_cannot_be_judged_is_said_before_anything_is_ranked(thresholds, spl
         evaluation_protocol(TRUTH, thresholds, split)
 
 
-def test_fingerprints_tell_what_is_right_apart():
-    shifted = FrameTruth(tuple(((row + 1) % QUERIES,) for row in range(QUERIES)), QUERIES)
-    protocols = [
-        evaluation_protocol(TRUTH, TOLERANCES),
-        evaluation_protocol(TRUTH, (0, 1, 2)),
-        evaluation_protocol(shifted, TOLERANCES),
-        evaluation_protocol(TRUTH, (1, 3)),
-    ]
-    assert len({protocol.fingerprint for protocol in protocols}) == 4
-    assert evaluation_protocol(TRUTH, TOLERANCES, "both").fingerprint == protocols[0].fingerprint
-
-
 @pytest.mark.parametrize("split", [None, "both"])
 def test_positions_are_reported_along_their_path_however_names_sort_them(split):
     """A street to the north whose names are sorted by easting, which is but noise."""
@@ -154,22 +141,6 @@ def test_places_that_the_map_does_not_show_are_none(unit):
         assert places_along_path(Positives.from_rows([[]] * queries, 4), unit).tolist() == [-1] * queries
 
 
-def test_p_along_the_path_is_rarely_low_without_a_difference_however_the_names_are_sorted():
-    """Two systems that are equally good, each with its own weak stretches of the street, which drives share."""
-    rng, draws, low = np.random.default_rng(0), 200, {"sorted by chance": 0, "along the path": 0}
-    names = rng.permutation(len(DRIVES))  # queries in the order of files
-    path = np.argsort(places_along_path(shown(0).take(names), "m"), kind="stable")
-    for _ in range(draws):
-        hits = []
-        for _ in range(2):
-            latent = np.convolve(rng.normal(size=PLACES + 14), np.ones(15), "valid") / np.sqrt(15)
-            hits.append((latent[DRIVES] > -0.5)[names])
-        low["sorted by chance"] += path_test(*hits).p_value <= 0.05
-        low["along the path"] += path_test(*np.array(hits)[:, path]).p_value <= 0.05
-    assert low["along the path"] <= 0.1 * draws
-    assert low["sorted by chance"] >= 0.3 * draws
-
-
 @pytest.mark.parametrize("tolerance", [0, 1, 3])
 def test_halves_never_share_a_place(tolerance):
     places = np.arange(20)
@@ -184,22 +155,6 @@ def test_halves_never_share_a_place(tolerance):
     assert sorted(reported) == list(range(20))
     first, second = halves(positives)
     assert len(first.tune) == len(second.tune) == 10 - 2 * tolerance
-
-
-@pytest.mark.parametrize("share", [0.3, 0.6])
-def test_queries_without_a_place_are_in_both_halves_of_a_map(share):
-    """One drive there, one back, and one elsewhere: neither half has all that is nowhere, or all that is somewhere."""
-    rng, drive = np.random.default_rng(0), np.arange(100)
-    there = np.where(rng.random(100) < share, -1, drive)
-    parts = [Positives.from_matrix(frame_positives(places, drive, tolerance=2))
-             for places in (there, there[::-1], np.full(50, -1))]  # fmt: skip
-    nowhere = np.concatenate([there, there[::-1], np.full(50, -1)]) < 0
-    both = halves_of_map(parts, "frames")
-    assert sorted(np.concatenate([half.report for half in both])) == list(range(250))
-    for half in both:
-        for side in (half.tune, half.report):
-            assert abs(nowhere[side].sum() - nowhere.sum() / 2) <= 2
-            assert abs((~nowhere[side]).sum() - (~nowhere).sum() / 2) <= 0.1 * (~nowhere).sum() + 8
 
 
 def test_neighbors_are_one_step_along_one_axis():

@@ -18,7 +18,6 @@ from mfvpr.retrieval.search import EXACT
 from mfvpr.storage import FeatureCache
 from mfvpr.storage.cache_files import MatchStore
 from mfvpr.tuning.sweeps import rank_settings
-from mfvpr.utils import InputError
 from tests.builders import match_set_of, random_matches
 from tests.scorers import FOREIGN, OWN, one_of_each_class, title
 from tests.storage.synthetic_features import assert_same_match_sets
@@ -115,29 +114,6 @@ def test_skipped_images_are_listed_and_never_shortlisted(small_street, tmp_path)
         np.testing.assert_array_equal(rankings.rank_shortlist(candidates, values)[0], range(5))
 
 
-@pytest.mark.parametrize("value", [np.nan, np.inf])
-def test_features_that_are_not_finite_are_named_and_rank_last(dataset, value):
-    class Broken:
-        image_size, interpolation, batch_size = SIFT.image_size, SIFT.interpolation, 3
-        vector_size, scales = SIFT.vector_size, SIFT.scales
-        calls = 0
-
-        def __call__(self, images):
-            described = SIFT(images)
-            if Broken.calls == 0:
-                described[1].features.descriptors[5, 3] = value
-            Broken.calls += 1
-            return described
-
-    cache, extractor = FeatureCache(), Broken()
-    [features] = cache.local(dataset.database, extractor)
-    assert list(features.bad) == [1]
-    assert "0001.png" in features.bad[1]
-    descriptors = cache.vectors(dataset.database, Aggregated(extractor, VladFitting(num_words=4)), dataset.database)
-    candidates = EXACT.shortlist(descriptors.values, descriptors.values, 10)
-    assert (candidates.indices != 1).all()
-
-
 def test_numbers_cost_no_compilation_within_a_capacity(features, candidates, matches, compilations):
     def scores(sigma, bin_size, window, tolerance):
         scorers = {
@@ -177,9 +153,3 @@ def test_every_scorer_on_images_of_two_sizes_with_a_confidence(mixed_sizes, scor
         np.testing.assert_allclose(got[query], mfvpr.score_candidates(scorer, match_set[query]), rtol=2e-6)
     assert np.isfinite(got).all()
     assert got.any()
-
-
-def test_too_many_bins_for_one_of_the_sizes_are_refused(mixed_sizes):
-    scorer = mfvpr.HistogramOfShifts(max_bins=50)  # enough for the first query, which is the smaller one
-    with pytest.raises(InputError, match="max_bins=50: expected at least 86"):
-        stages.score({"it": scorer}, *mixed_sizes)

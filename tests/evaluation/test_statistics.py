@@ -58,16 +58,13 @@ def test_design_effect_equals_the_loops(correlation):
         assert design_effect(hits) == pytest.approx(effect_oracle(hits.astype(int).tolist()), rel=1e-9)
 
 
-@pytest.mark.parametrize("level", [0.9, 0.95])
-def test_interval_is_the_binomial_one_of_as_many_queries_as_the_path_is_worth(level):
+def test_interval_is_the_binomial_one_of_as_many_queries_as_the_path_is_worth():
     for hits in latent_paths(0.8, 0.5, 60, count=10, seed=2)[0]:
         worth = 60 / design_effect(hits)
-        correct, tail = hits.mean() * worth, (1 - level) / 2
-        low, high = recall_interval(hits, level=level)
-        assert stats.beta(correct, worth - correct + 1).cdf(low) == pytest.approx(tail)
-        assert stats.beta(worth - correct, correct + 1).cdf(1 - high) == pytest.approx(
-            tail, rel=1e-3
-        )  # 1 - high is small
+        correct, (low, high) = hits.mean() * worth, recall_interval(hits)
+        assert stats.beta(correct, worth - correct + 1).cdf(low) == pytest.approx(0.025)
+        tail = stats.beta(worth - correct, correct + 1).cdf(1 - high)
+        assert tail == pytest.approx(0.025, rel=1e-3)  # 1 - high is small
 
 
 # Autocorrelations of the latent path for which the hits have 0.9 from query to query.
@@ -100,10 +97,12 @@ def test_the_recall_is_inside_and_misses_mirror_hits():
             np.testing.assert_allclose(recall_interval(~hits), (1 - high, 1 - low), atol=1e-9)
 
 
-def test_an_interval_needs_one_system_and_no_query():
+def test_hits_are_of_one_system_or_of_two_on_the_same_queries():
     assert recall_interval(np.zeros(0)) == (0.0, 1.0)
     with pytest.raises(InputError, match=r"hits: expected \[Q\].* got \[2, 5\]"):
         recall_interval(np.ones((2, 5), bool))
+    with pytest.raises(InputError, match=r"got \[5\], \[4\]"):
+        path_test(np.ones(5), np.ones(4))
 
 
 @pytest.mark.parametrize(("only_first", "only_second"), [(0, 0), (1, 0), (3, 3), (9, 2), (2, 9), (0, 12)])
@@ -145,14 +144,3 @@ def test_equal_systems_often_differ_by_mcnemar_along_a_path_and_a_better_one_is_
     assert np.mean([path_test(*pair).p_value <= 0.05 for pair in pairs]) <= 0.07
     worse, better = latent_paths(0.8, 0, 300, seed=1)[0], latent_paths(0.9, 0, 300, seed=2)[0]
     assert np.mean([path_test(*pair).p_value <= 0.05 for pair in zip(worse, better, strict=True)]) > 0.6
-
-
-def test_a_path_needs_the_same_queries():
-    with pytest.raises(InputError, match=r"got \[5\], \[4\]"):
-        path_test(np.ones(5), np.ones(4))
-
-
-def test_a_level_is_a_share():
-    for level in (95, 0, -1):
-        with pytest.raises(InputError, match="level"):
-            recall_interval(np.ones(30, bool), level=level)

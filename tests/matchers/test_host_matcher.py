@@ -7,7 +7,7 @@ import pytest
 
 import mfvpr
 from mfvpr.datasets import Dataset, ImageFolder
-from mfvpr.evaluation.sequence_matching import match_sequence
+from mfvpr.evaluation.dataset_ranking import match_sequence
 from mfvpr.features import Aggregated, Sift, VladFitting
 from mfvpr.retrieval import MatchFiles, Retrieval
 from mfvpr.retrieval.precomputed import File
@@ -175,8 +175,6 @@ def test_where_a_matcher_must_be_compiled_it_is_refused(dataset, tmp_path):
     system = mfvpr.System(pipeline(mfvpr.HostMatcher(Counting(), "square")), SCORERS)
     with one_line_error("HostMatcher", "map"):
         mfvpr.Map.create(tmp_path / "map", dataset.database.root, system)
-    with one_line_error("HostMatcher", "features"):
-        system.warm_up((64, 48))
 
 
 def write_hloc_matches(path, result, sequence, database, skip=()):

@@ -1,5 +1,6 @@
 """Comparison of learned, hand-set and grid-searched scores, on queries that none of them was chosen on."""
 
+import itertools
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
@@ -7,13 +8,12 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool
 
-from mfvpr.core.metrics import hits
 from mfvpr.core.scorer import Scorer
 from mfvpr.core.types import Shortlist
 from mfvpr.core.weights import DescriptorDistanceWeight, FeatureScoreWeight, RatioWeight, UnitWeight
 from mfvpr.evaluation.protocol import EvaluationProtocol, best_setting
 from mfvpr.matchers.match_set import MatchSet
-from mfvpr.tuning.learning.models import Model, Options, of_matches, start, train
+from mfvpr.tuning.learning.models import Model, Options, train
 from mfvpr.tuning.learning.splits import TrainingSplit, training_splits
 from mfvpr.tuning.learning.training import Checkpoints, Fit
 from mfvpr.tuning.sweeps.setting_rankings import FUSION, Setting, SweepOptions, rank_settings
@@ -79,73 +79,67 @@ def compare(
     """
     if not can_learn(axes.scorer) or not hasattr(axes.scorer, "weight"):
         raise InputError(f"{type(axes.scorer).__name__}: expected a scorer with numbers to learn and a match weight")
-    axes.check(match_set.image_sizes)
     options = options or Options()
     splits = training_splits(match_set, candidates, protocol, retrieval_score=options.retrieval_score)
-    halves = [_HalfComparison(split, axes, options, checkpoints, runtime) for split in splits]
-    return Comparison(protocol, match_set, candidates, [list(half.rows()) for half in halves])
+    halves = [list(HalfComparison(split, axes, options, checkpoints, runtime).rows()) for split in splits]
+    return Comparison(protocol, match_set, candidates, halves)
 
 
 @dataclass(frozen=True)
-class _HalfComparison:
+class HalfComparison:
     """One half of `compare`; the other fields are its arguments."""
 
     split: TrainingSplit
     axes: Axes
     options: Options
-    checkpoints: Checkpoints | None
-    runtime: Runtime
+    checkpoints: Checkpoints | None = None
+    runtime: Runtime = DEFAULT_RUNTIME
 
     def rows(self) -> Iterator[Row]:
         """All scores, each evaluated as soon as it is chosen or learned."""
+        split, options = self.split, self.options
         scorer: Any = self.axes.scorer
-        yield from self.by_hand("paper" if isinstance(scorer.weight, _OF_THE_PAPER) else "as set", scorer)
-        yield from self.by_hand("1 - ratio", replace(scorer, weight=RatioWeight()))
-        deviation = self.split.score_deviation(scorer)
-        for fused in (False, True):
-            name = "grid search" + " + retrieval" * fused
-            setting, values = self.search(name, deviation, fused=fused)
-            yield replace(self.evaluate(name, scorer, setting), values=values)
-        for learned_weight in (False, True):
-            for fused in (False, True):
-                name = ("match weights" if learned_weight else "gradient") + " + retrieval" * fused
-                model = start(self.split, scorer, self.options, fused=fused, learned_weight=learned_weight)
-                fitted = self.learn(name, model)
-                values = model.values(fitted.parameters)
-                setting = {FUSION: values[FUSION]} if fused else {}
-                row = self.evaluate(name, model.scorer_of(fitted.parameters), setting)
-                yield replace(row, values=values, fitted=fitted)
-        name, model = "match labels", of_matches(self.split, scorer, self.options)
+        by_hand = {"paper" if isinstance(scorer.weight, _OF_THE_PAPER) else "as set": scorer}
+        by_hand["1 - ratio"] = replace(scorer, weight=RatioWeight())
+        for name, hand_set in by_hand.items():
+            yield self.evaluate(name, hand_set, {})
+            yield self.evaluate(f"{name} + retrieval", hand_set, {FUSION: options.c})
+        for name, fused in (("grid search", False), ("grid search + retrieval", True)):
+            setting, values = self.search(name, fused=fused)
+            yield self.evaluate(name, scorer, setting, values)
+        for learned_weight, fused in itertools.product((False, True), repeat=2):
+            name = ("match weights" if learned_weight else "gradient") + " + retrieval" * fused
+            model = Model.of_ranking(split, scorer, options, fused=fused, learned_weight=learned_weight)
+            fitted = self.learn(name, model)
+            values = model.values(fitted.parameters)
+            setting = {FUSION: values[FUSION]} if fused else {}
+            yield self.evaluate(name, model.scorer_of(fitted.parameters), setting, values, fitted)
+        name, model = "match labels", Model.of_matches(split, scorer, options)
         fitted = self.learn(name, model)
-        for row in self.by_hand(name, model.scorer_of(fitted.parameters)):
-            yield replace(row, fitted=fitted if row.name == name else None)  # both rows have the same training
+        learned = model.scorer_of(fitted.parameters)
+        yield self.evaluate(name, learned, {}, fitted=fitted)
+        yield self.evaluate(f"{name} + retrieval", learned, {FUSION: options.c})
 
-    def by_hand(self, name: str, scorer: Scorer) -> Iterator[Row]:
-        """The scorer alone, and fused with the retrieval by the c of the options."""
-        yield self.evaluate(name, scorer, {})
-        yield self.evaluate(f"{name} + retrieval", scorer, {FUSION: self.options.c})
-
-    def evaluate(self, name: str, scorer: Scorer, setting: Setting) -> Row:
+    def evaluate(
+        self, name: str, scorer: Scorer, setting: Setting, values: Any = None, fitted: Fit | None = None
+    ) -> Row:
         """Evaluate a setting on the half to report on, with all candidates."""
-        queries, protocol = self.split.half.report, self.split.protocol
+        queries = self.split.half.report
         [first] = self.first_rows(name, scorer, [setting], queries, self.split.candidates.mask)
-        by_threshold = [hits(first, positives.take(queries)) for positives in protocol.positives]
-        return Row(self.split.name, name, np.stack(by_threshold), {}, None)
+        return Row(self.split.name, name, self.split.protocol.hits(first, queries), values or {}, fitted)
 
-    def search(self, name: str, deviation: float, *, fused: bool) -> tuple[Setting, Mapping[str, Any]]:
+    def search(self, name: str, *, fused: bool) -> tuple[Setting, Mapping[str, Any]]:
         """The best setting of the grid on the half to choose on: as the sweep takes it, and as plain values."""
-        axes = self.axes if fused else self.axes.without(FUSION)
-        grid, queries, protocol = axes.grid(), self.split.half.tune, self.split.protocol
-        settings = [{**axes.setting(plain)} for plain in grid]
-        for setting in settings:
-            if fused and FUSION not in setting:
-                setting[FUSION] = self.options.c
-            elif setting.get(FUSION) is not None:
-                setting[FUSION] *= self.split.balance(deviation)  # in units of the scores
+        axes, queries, protocol = self.axes, self.split.half.tune, self.split.protocol
+        axes = axes if fused else Axes(axes.scorer, {k: v for k, v in axes.values.items() if k != FUSION})
+        settings = [dict(axes.setting(plain)) for plain in axes.grid()]
+        balanced_c = self.split.balance(self.split.score_deviation(axes.scorer))  # in units of the scores
+        for setting in settings if fused else ():
+            c = setting.get(FUSION)
+            setting[FUSION] = self.options.c if FUSION not in setting else None if c is None else c * balanced_c
         rows = self.first_rows(name, axes.scorer, settings, queries, self.split.seen)
-        recall = hits(rows, protocol.positives[protocol.main].take(queries)).mean(axis=-1)
-        best = best_setting(recall, axes.values)
-        return settings[best], grid[best]
+        best = best_setting(protocol.hits(rows, queries)[protocol.main].mean(axis=-1), axes.values)
+        return settings[best], axes.grid()[best]
 
     def first_rows(
         self, name: str, scorer: Scorer, settings: Sequence[Setting], queries: np.ndarray, seen: np.ndarray
@@ -156,11 +150,10 @@ class _HalfComparison:
         return rank_settings(scorer, settings, *self.split.part(queries), views=[seen[queries]], options=options)[0]
 
     def learn(self, name: str, model: Model) -> Fit:
-        """Train a model, with checkpoints in the folder `half-name`."""
-        checkpoints = self.checkpoints
+        """Train a model, with a checkpoint of its own."""
+        track, checkpoints = self.runtime.progress(f"{self.split.name}: {name}"), self.checkpoints
         if checkpoints:
-            folder_name = f"{self.split.name}-{name}".replace(" ", "_").replace("_+_", "_")
             recipe = {**checkpoints.recipe, "half": self.split.name, "model": name}
-            checkpoints = Checkpoints(checkpoints.folder / folder_name, recipe)
-        track = self.runtime.progress(f"{self.split.name}: {name}")
+            label = f"{self.split.name}-{name}".replace(" ", "_").replace("_+_", "_")
+            checkpoints = Checkpoints(checkpoints.folder, recipe, label)
         return train(self.split, model, self.options, checkpoints=checkpoints, track=track)

@@ -6,7 +6,6 @@ gradient 0. For `mean_loss`, set a temperature with `functools.partial`. A tempe
 temperature not above 0 makes the loss NaN.
 """
 
-import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import partial
@@ -28,15 +27,14 @@ from mfvpr.core.weights import RatioWeight, UnitWeight
 from mfvpr.evaluation.rankings import RetrievalScore, Ties
 from mfvpr.tuning.learning.splits import Batch, TrainingSplit
 from mfvpr.tuning.learning.training import Fit, Schedule, fit
-from mfvpr.utils.errors import InputError
 from mfvpr.utils.numerics import as_float, masked, masked_mean, positive
 
 Loss = Callable[[Array, Array, Array], Array]
+Scores = Num[Array, " candidates"]
+Mask = Bool[Array, " candidates"]
 
 
-def cross_entropy(
-    scores: Num[Array, " candidates"], positives: Bool[Array, " candidates"], mask: Bool[Array, " candidates"]
-) -> Float[Array, ""]:
+def cross_entropy(scores: Scores, positives: Mask, mask: Mask) -> Float[Array, ""]:
     """-log of the probability that softmax(scores) gives to all positives together, in nats."""
     scores, positives, real, teaches = _usable(scores, positives, mask)
     # The highest score is subtracted first: else scores in the thousands round a small loss away.
@@ -46,10 +44,7 @@ def cross_entropy(
 
 
 def smooth_recall_at_1(
-    scores: Num[Array, " candidates"],
-    positives: Bool[Array, " candidates"],
-    mask: Bool[Array, " candidates"],
-    temperature: float | Float[Array, ""],
+    scores: Scores, positives: Mask, mask: Mask, temperature: float | Float[Array, ""]
 ) -> Float[Array, ""]:
     """1 - the probability that softmax(scores / temperature) gives to the positives, in [0, 1].
 
@@ -61,10 +56,7 @@ def smooth_recall_at_1(
 
 
 def smooth_average_precision(
-    scores: Num[Array, " candidates"],
-    positives: Bool[Array, " candidates"],
-    mask: Bool[Array, " candidates"],
-    temperature: float | Float[Array, ""],
+    scores: Scores, positives: Mask, mask: Mask, temperature: float | Float[Array, ""]
 ) -> Float[Array, ""]:
     """1 - Smooth-AP (Brown et al., ECCV 2020, equation 4), in [0, 1].
 
@@ -80,12 +72,11 @@ def smooth_average_precision(
     return jnp.where(teaches, 1 - masked_mean(rank_among_positives / rank, positives), 0.0)
 
 
-LOSSES: dict[str, Loss] = {
+LOSSES: dict[str, Loss] = {  # of the programs
     "cross_entropy": cross_entropy,
     "recall": partial(smooth_recall_at_1, temperature=1.0),
     "average_precision": partial(smooth_average_precision, temperature=1.0),
 }
-"""Losses of the programs, by name."""
 
 
 def mean_loss(
@@ -112,76 +103,6 @@ SHARPNESS = 2.0  # of the loss at the start, per unit of the scores
 
 # `numbers` by name, `c` and `sharpness` as logarithms, which keeps them above 0, and `weight`
 Parameters = dict[str, Any]
-Objective = Callable[[Parameters, Batch], Array]
-
-
-@dataclass(frozen=True)
-class Model:
-    """A score with parameters to learn, from the ranking, or from a teacher's labels of single matches."""
-
-    scorer: Any  # its numbers are learned; its other parameters stay
-    start: Parameters
-    unit: float  # spread of the scores at the start; the loss sees scores in this unit
-    teacher: HistogramOfShifts | None = None  # labels the matches of correct pairs as correct or incorrect
-
-    def scorer_of(self, parameters: Parameters) -> Any:
-        """The soft scorer."""
-        numbers = {name: jnp.exp(logarithm) for name, logarithm in parameters["numbers"].items()}
-        weight = {"weight": parameters["weight"]} if "weight" in parameters else {}
-        return replace(self.scorer, **numbers, **weight)
-
-    def c_of(self, parameters: Parameters) -> Array | None:
-        """Weight of the retrieval; None if the score is not fused."""
-        return self.unit * jnp.exp(parameters["c"]) if "c" in parameters else None
-
-    def values(self, parameters: Parameters) -> dict[str, float]:
-        """Learned values by name, without the match weight."""
-        scorer, c = self.scorer_of(parameters), self.c_of(parameters)
-        numbers = {name: float(getattr(scorer, name)) for name in parameters["numbers"]}
-        return numbers if c is None else numbers | {"c": float(c)}
-
-    def objective(self, loss: Loss) -> Objective:
-        """A function of parameters and a batch: the mean loss of its queries, or of its matches with a teacher."""
-
-        def ranking_loss(parameters: Parameters, batch: Batch) -> Array:
-            scorer, c = self.scorer_of(parameters), self.c_of(parameters)
-            scores = jax.vmap(lambda matches: score_candidates(scorer, matches))(batch.matches)
-            scores = scores if c is None else combine(batch.retrieval_scores, scores, c=c)
-            logits = scores / self.unit * jnp.exp(parameters["sharpness"])
-            return mean_loss(loss, logits, batch.positives, batch.mask)
-
-        return ranking_loss if self.teacher is None else partial(_match_loss, self.teacher)
-
-
-def first_numbers(scorer: Any, spread: float) -> dict[str, Array]:
-    """Logarithms of the values to start learning from, by field: the scorer's values, or declared ones for None.
-
-    `spread` is the standard deviation of the scores. A value that is not above 0 raises an `InputError`.
-    """
-    numbers = {}
-    for name, field in parameters_of(scorer).items():
-        if field.learned:
-            default = field.start * (spread if field.unit == SCORE else 1.0)
-            value = getattr(scorer, name)
-            number = float(default if value is None else value)
-            if not 0 < number < math.inf:
-                raise InputError(f"{name}={number}: expected a number above 0 to start from")
-            numbers[name] = jnp.log(as_float(number))
-    return numbers
-
-
-def _match_loss(teacher: HistogramOfShifts, parameters: Parameters, batch: Batch) -> Array:
-    """Cross entropy of the labels of matches, `[]`, in nats; correct and incorrect ones have the same total weight."""
-    weight: LearnedWeight = parameters["weight"]
-
-    def logits_and_labels(matches: Matches, positive: Array) -> tuple[Array, Array]:
-        peak = teacher.dominant_shift(matches, refine=True)
-        return weight.logits(matches), teacher.agrees(matches, peak) & positive
-
-    of_pairs = jax.vmap(jax.vmap(logits_and_labels))(batch.matches, batch.positives)
-    logits, correct = (values.reshape(-1) for values in of_pairs)
-    incorrect = (batch.matches.mask & batch.mask[..., None]).reshape(-1) & ~correct
-    return (masked_mean(jax.nn.softplus(-logits), correct) + masked_mean(jax.nn.softplus(logits), incorrect)) / 2
 
 
 @dataclass(frozen=True)
@@ -202,34 +123,71 @@ class Options:
     seed: int = 0  # of the network, and of the order of the queries
 
 
-def start(
-    split: TrainingSplit, scorer: Any, options: Options, *, fused: bool = False, learned_weight: bool = False
-) -> Model:
-    """The model that learns from rankings, starting from a hard scorer.
+@dataclass(frozen=True)
+class Model:
+    """A score with parameters to learn, from the ranking, or from a teacher's labels of single matches."""
 
-    It learns the retrieval's weight as well (`fused`), and the match weight, starting from 1 (`learned_weight`).
-    """
-    scorer = replace(scorer, weight=UnitWeight()) if learned_weight else scorer  # the start of a learned weight
-    deviation = split.score_deviation(scorer)
-    scorer = fit_capacities(scorer, *split.match_set.image_sizes)
-    first: Parameters = {"numbers": first_numbers(scorer, deviation), "sharpness": jnp.log(jnp.asarray(SHARPNESS))}
-    if fused:
-        c = FIRST_SHARE * split.balance(deviation)
-        first["c"] = jnp.log(jnp.asarray(max(c, LEAST_C * deviation) / deviation))
-    if learned_weight:
-        first["weight"] = _first_weight(split, options)
-    return Model(scorer, first, deviation)
+    scorer: Any  # its numbers are learned; its other parameters stay
+    start: Parameters
+    unit: float = 1.0  # spread of the scores at the start; the loss sees scores in this unit
+    teacher: HistogramOfShifts | None = None  # labels the matches of correct pairs as correct or incorrect
 
+    @classmethod
+    def of_ranking(
+        cls, split: TrainingSplit, scorer: Any, options: Options, *, fused: bool = False, learned_weight: bool = False
+    ) -> "Model":
+        """The model that learns from rankings, starting from a hard scorer.
 
-def of_matches(split: TrainingSplit, scorer: Any, options: Options) -> Model:
-    """The model that learns a match weight from labels of single matches."""
-    sizes = split.match_set.image_sizes
-    seen, _ = split.match_set.take(split.half.tune).image_sizes  # else reported images would change the labels
-    sigma = TEACHER_SIGMA * float(np.max(seen))
-    teacher = HistogramOfShifts(bin_size=sigma / 2, sigma=sigma, weight=RatioWeight())
-    scorer = fit_capacities(scorer, *sizes)
-    first = {"numbers": {}, "weight": _first_weight(split, options)}
-    return Model(scorer, first, 1.0, fit_capacities(teacher, *sizes))
+        It learns the retrieval's weight as well (`fused`), and the match weight, starting from 1 (`learned_weight`).
+        """
+        scorer = replace(scorer, weight=UnitWeight()) if learned_weight else scorer
+        deviation, numbers = split.score_deviation(scorer), {}
+        for name, field in parameters_of(scorer).items():
+            if field.learned:
+                value, default = getattr(scorer, name), field.start * (deviation if field.unit == SCORE else 1.0)
+                numbers[name] = jnp.log(as_float(float(default if value is None else value)))
+        start: Parameters = {"numbers": numbers, "sharpness": jnp.log(jnp.asarray(SHARPNESS))}
+        if fused:
+            c = max(FIRST_SHARE * split.balance(deviation), LEAST_C * deviation)
+            start["c"] = jnp.log(jnp.asarray(c / deviation))
+        if learned_weight:
+            start["weight"] = _first_weight(split, options)
+        return cls(fit_capacities(scorer, *split.match_set.image_sizes), start, deviation)
+
+    @classmethod
+    def of_matches(cls, split: TrainingSplit, scorer: Any, options: Options) -> "Model":
+        """The model that learns a match weight from labels of single matches."""
+        sizes = split.match_set.image_sizes
+        seen, _ = split.match_set.take(split.half.tune).image_sizes  # else reported images would change the labels
+        sigma = TEACHER_SIGMA * float(np.max(seen))
+        teacher = HistogramOfShifts(bin_size=sigma / 2, sigma=sigma, weight=RatioWeight())
+        start = {"numbers": {}, "weight": _first_weight(split, options)}
+        return cls(fit_capacities(scorer, *sizes), start, teacher=fit_capacities(teacher, *sizes))
+
+    def scorer_of(self, parameters: Parameters) -> Any:
+        """The soft scorer."""
+        numbers = {name: jnp.exp(logarithm) for name, logarithm in parameters["numbers"].items()}
+        weight = {"weight": parameters["weight"]} if "weight" in parameters else {}
+        return replace(self.scorer, **numbers, **weight)
+
+    def values(self, parameters: Parameters) -> dict[str, float]:
+        """Learned values by name, with the weight `c` of the retrieval if it is learned, without the match weight."""
+        values = {name: jnp.exp(logarithm) for name, logarithm in parameters["numbers"].items()}
+        values |= {"c": self.unit * jnp.exp(parameters["c"])} if "c" in parameters else {}
+        return {name: float(value) for name, value in values.items()}
+
+    def objective(self, loss: Loss) -> Callable[[Parameters, Batch], Array]:
+        """A function of parameters and a batch: the mean loss of its queries, or of its matches with a teacher."""
+
+        def ranking_loss(parameters: Parameters, batch: Batch) -> Array:
+            scorer = self.scorer_of(parameters)
+            scores = jax.vmap(lambda matches: score_candidates(scorer, matches))(batch.matches)
+            if "c" in parameters:
+                scores = combine(batch.retrieval_scores, scores, c=self.unit * jnp.exp(parameters["c"]))
+            logits = scores / self.unit * jnp.exp(parameters["sharpness"])
+            return mean_loss(loss, logits, batch.positives, batch.mask)
+
+        return ranking_loss if self.teacher is None else partial(_match_loss, self.teacher)
 
 
 def _first_weight(split: TrainingSplit, options: Options) -> LearnedWeight:
@@ -239,10 +197,23 @@ def _first_weight(split: TrainingSplit, options: Options) -> LearnedWeight:
     return LearnedWeight.create(jax.random.key(options.seed), matches, options.hidden, names=options.inputs)
 
 
+def _match_loss(teacher: HistogramOfShifts, parameters: Parameters, batch: Batch) -> Array:
+    """Cross entropy of the labels of matches, `[]`, in nats; correct and incorrect ones have the same total weight."""
+    weight: LearnedWeight = parameters["weight"]
+
+    def logits_and_labels(matches: Matches, positive: Array) -> tuple[Array, Array]:
+        peak = teacher.dominant_shift(matches, refine=True)
+        return weight.logits(matches), teacher.agrees(matches, peak) & positive
+
+    of_pairs = jax.vmap(jax.vmap(logits_and_labels))(batch.matches, batch.positives)
+    logits, correct = (values.reshape(-1) for values in of_pairs)
+    incorrect = (batch.matches.mask & batch.mask[..., None]).reshape(-1) & ~correct
+    return (masked_mean(jax.nn.softplus(-logits), correct) + masked_mean(jax.nn.softplus(logits), incorrect)) / 2
+
+
 def train(split: TrainingSplit, model: Model, options: Options, **keeping: Any) -> Fit:
     """Learn a model's parameters; `keeping` are `checkpoints` and `track` of `training.fit`."""
-    size = options.batch
-    objective = model.objective(options.loss)
+    size, objective = options.batch, model.objective(options.loss)
     loss = jax.jit(objective)
     parts = [split.validation[place : place + size] for place in range(0, len(split.validation), size)]
     validation = [(split.batch(part, size), len(part)) for part in parts]

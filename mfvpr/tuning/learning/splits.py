@@ -1,6 +1,6 @@
 """Queries to train on and to validate on, of one half of a path or of several joined data sets."""
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
 from typing import Any
@@ -99,10 +99,7 @@ def training_splits(
 ) -> list[TrainingSplit]:
     """Split each half of a protocol into queries to train on and queries to validate on.
 
-    `retrieval_score` is the retrieval's part of a combined score, see `retrieval_scores`.
-
-    Raises:
-        InputError: the protocol has no halves, or a half has no usable queries to train on or to validate on.
+    An InputError if the protocol has no halves, or a half has no usable queries to train on or to validate on.
     """
     if not protocol.halves:
         reason = "since what is learned is never reported on the same queries"
@@ -138,31 +135,23 @@ class Part:
 def join_data_sets(teach: Sequence[Part], report: Sequence[Part]) -> Part:
     """Join data sets to one, whose protocol learns on the first sets and reports on the others.
 
-    Raises:
-        InputError: `teach` or `report` is empty, two sets have the same name, or units or thresholds differ.
+    An InputError if two sets have the same name, or units or thresholds differ.
     """
     parts = [*teach, *report]
-    if not teach or not report:
-        raise InputError(f"expected data sets to learn on and to report on, got {len(teach)} and {len(report)}")
-    names = [part.name for part in parts]
+    names, first = [part.name for part in parts], parts[0]
     if len({*names}) < len(names):
         raise InputError(f"expected data sets of different names, got {', '.join(names)}")
-    for part in parts[1:]:
-        for what in ("unit", "thresholds"):
-            expected, got = getattr(parts[0].protocol, what), getattr(part.protocol, what)
-            if expected != got:
-                fix = "compare sets whose ground truth is of one kind"
-                raise InputError(f"{part.name}: expected the {what} of {names[0]}, {expected}, got {got}; {fix}")
+    for part in parts:
+        expected, got = ((each.protocol.unit, each.protocol.thresholds) for each in (first, part))
+        if expected != got:
+            words = "unit {} with thresholds {}".format
+            raise InputError(f"{part.name}: expected {words(*expected)} as {first.name} has, got {words(*got)}")
     sizes, databases = ([len(part.match_set) for part in parts], [part.protocol.places.num_database for part in parts])
-    split = sum(sizes[: len(teach)])
-    half = Half(
-        np.arange(split),
-        np.arange(split, sum(sizes)),
-        np.arange(sum(databases)) < sum(databases[: len(teach)]),
-        tuple(sizes[: len(teach)]),
-    )
+    split, allowed = sum(sizes[: len(teach)]), sum(databases[: len(teach)])
+    queries, rows = np.arange(sum(sizes)), np.arange(sum(databases))
+    half = Half(queries[:split], queries[split:], rows < allowed, tuple(sizes[: len(teach)]))
     protocol = replace(
-        parts[0].protocol,
+        first.protocol,
         positives=[join_positives(sets) for sets in zip(*(part.protocol.positives for part in parts), strict=True)],
         places=join_positives([part.protocol.places for part in parts]),
         halves=[half],
@@ -170,39 +159,36 @@ def join_data_sets(teach: Sequence[Part], report: Sequence[Part]) -> Part:
         reported_sets={part.name: len(part.match_set) for part in report},
     )
     width = max(part.match_set.counts.shape[1] for part in parts)
-    starts = np.cumsum([0, *databases[:-1]])
+
+    def join(arrays: Iterable[np.ndarray], fill: Any) -> np.ndarray:
+        """Arrays `[queries, candidates]`, padded to the widest, one below the other."""
+        padding = lambda array: [(0, 0), (0, width - array.shape[1])]  # noqa: E731
+        return np.concatenate([np.pad(array, padding(array), constant_values=fill) for array in arrays])
+
+    listed = [part.candidates for part in parts]
+    starts = zip(listed, np.cumsum([0, *databases[:-1]]), strict=True)
+    indices = [np.where(each.mask, each.indices + start, -1).astype(np.int32) for each, start in starts]
+    scores, mask = join([each.scores for each in listed], 0), join([each.mask for each in listed], False)
     match_set = MatchSet(
-        _Chain([part.match_set.matches for part in parts], width),
-        np.concatenate([_pad(part.match_set.counts, width, 0) for part in parts]),
+        _Joined([part.match_set.matches for part in parts], width),
+        join([part.match_set.counts for part in parts], 0),
         max(part.match_set.capacity for part in parts),
     )
-    shortlists = []
-    for candidates, start in zip([part.candidates for part in parts], starts, strict=True):
-        indices = np.where(candidates.indices >= 0, candidates.indices + start, -1).astype(np.int32)
-        scores, mask = np.asarray(candidates.scores), np.asarray(candidates.mask)
-        shortlists.append(Shortlist(_pad(indices, width, -1), _pad(scores, width, 0), _pad(mask, width, False)))
-    return Part(" ".join(names), protocol, match_set, jax.tree.map(lambda *rows: np.concatenate(rows), *shortlists))
+    return Part(" ".join(names), protocol, match_set, Shortlist(join(indices, -1), scores, mask))
 
 
-def _pad(values: np.ndarray, width: int, fill: Any) -> np.ndarray:
-    return np.pad(values, [(0, 0), (0, width - values.shape[1])], constant_values=fill)
-
-
-class _Chain(Sequence[Matches]):
+class _Joined(Sequence[Matches]):
     """Matches of the queries of several sets, one set after the other; padded candidates have no matches."""
 
     def __init__(self, parts: Sequence[Sequence[Matches]], width: int) -> None:
-        self._parts, self._width = parts, width
-        self._ends = np.cumsum([len(part) for part in parts])
+        self._rows, self._width = [(part, row) for part in parts for row in range(len(part))], width
 
     def __len__(self) -> int:
-        return int(self._ends[-1])
+        return len(self._rows)
 
     def __getitem__(self, query: Any) -> Matches:
         """Matches of one query; slices are not supported."""
-        query = range(len(self))[query]
-        number = int(np.searchsorted(self._ends, query, side="right"))
-        part = self._parts[number]
-        matches = part[query - int(self._ends[number]) + len(part)]
+        part, row = self._rows[query]
+        matches = part[row]
         of_candidates = {name: values for name, values in per_pair(matches).items() if name.endswith("1")}
-        return replace(matches, **{name: repeat_last(values, self._width) for name, values in of_candidates.items()})
+        return replace(matches, **{name: repeat_last(each, self._width) for name, each in of_candidates.items()})

@@ -1,13 +1,10 @@
 """Gradient descent on a pytree of arrays, with validation, early stopping, and resuming to the bit."""
 
 import json
-import logging
 import math
-import warnings
-import zlib
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager, nullcontext
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -15,92 +12,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import optax
-import orbax.checkpoint as ocp
 
 from mfvpr.core.types import Array
+from mfvpr.storage.cache_files import CacheFiles
 from mfvpr.utils.errors import InputError
-from mfvpr.utils.files import lock_folder
 from mfvpr.utils.runtime import Track, no_progress
 
-
-@contextmanager
-def _lock(folder: Path) -> Iterator[None]:
-    """Lock a folder of checkpoints, which is made if it is missing."""
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise InputError(f"{folder}: no checkpoint can be kept here ({_reason(error)}); check the path") from None
-    in_use = InputError(f"{folder}: another process trains here; wait until it ends, or choose another folder")
-    with lock_folder(folder, in_use):
-        yield
-
-
-def save_checkpoint(folder: Path, step: int, recipe: Mapping[str, Any], state: Any, progress: Any) -> None:
-    """Write the pytree `state`, with JSON values, at a step above all earlier ones; remove all but the last two."""
-    leaves = [np.asarray(leaf) for leaf in jax.tree.leaves(state)]
-    record = json.dumps([recipe, progress, _checksum(leaves, progress)]).encode()
-    arrays = {str(place): leaf for place, leaf in enumerate(leaves)} | {"record": np.frombuffer(record, np.uint8)}
-    try:
-        with _manager(folder) as manager:
-            manager.save(step, args=ocp.args.StandardSave(arrays))
-    except (OSError, ValueError, RuntimeError) as error:
-        words = f"the checkpoint of step {step} cannot be written ({_reason(error)}); check the path and its disk"
-        raise InputError(f"{folder}: {words}") from None
-
-
-def restore(folder: Path, recipe: Mapping[str, Any], state: Any) -> tuple[Any, Any] | None:
-    """State and progress of the newest checkpoint, None without one; `state` has the same structure.
-
-    An InputError for another recipe or damage; nothing in the folder is changed.
-    """
-    if not folder.exists():
-        return None
-    with _manager(folder, read_only=True) as manager:
-        step = manager.latest_step()
-        if step is None:
-            return None
-        try:
-            arrays = dict(manager.restore(step, args=ocp.args.StandardRestore()))
-            stored, progress, checksum = json.loads(arrays.pop("record").tobytes())
-            leaves = [arrays[str(place)] for place in range(len(arrays))]
-            if _checksum(leaves, progress) != checksum:
-                raise ValueError("another checksum")
-        except (OSError, ValueError, KeyError, TypeError, AttributeError, RuntimeError) as error:
-            words = f"expected a checkpoint of mfvpr, got another or a damaged one ({_reason(error)})"
-            raise InputError(f"{folder / str(step)}: {words}; delete it to go on from the one before") from None
-    expected = json.loads(json.dumps(recipe))  # tuples become lists
-    if names := [name for name in {**expected, **stored} if expected.get(name) != stored.get(name)]:
-        words = f"expected checkpoints of this training, got those of another {names[0]}"
-        raise InputError(f"{folder}: {words}; choose another folder, or delete this one")
-    return jax.tree.unflatten(jax.tree.structure(state), leaves), progress
-
-
-@contextmanager
-def _manager(folder: Path, read_only: bool = False) -> Iterator[ocp.CheckpointManager]:
-    """Orbax's manager, without its logs and warnings."""
-    logger = logging.getLogger("absl")
-    level = logger.level
-    logger.setLevel(logging.CRITICAL)
-    try:
-        options = ocp.CheckpointManagerOptions(
-            max_to_keep=None if read_only else 2,
-            enable_async_checkpointing=False,  # `save` returns when the checkpoint is on disk
-            cleanup_tmp_directories=not read_only,
-            save_root_metadata=False,
-            read_only=read_only,
-        )
-        with warnings.catch_warnings(action="ignore"), ocp.CheckpointManager(folder.absolute(), options=options) as it:
-            yield it
-    finally:
-        logger.setLevel(level)
-
-
-def _checksum(leaves: Sequence[np.ndarray], progress: Any) -> int:
-    return zlib.crc32(b"".join([json.dumps(progress).encode(), *(leaf.tobytes() for leaf in leaves)]))
-
-
-def _reason(error: Exception) -> str:
-    return " ".join(str(error).partition("[")[0].split())[:200]
+_KEY = "00last"  # of the checkpoint in its folder
 
 
 class TrainingError(InputError):
@@ -124,17 +42,12 @@ class Fit(NamedTuple):
     ended: str  # why the training ended, in words
 
 
-class _State(NamedTuple):
-    parameters: Any
-    best: Any
-    optimizer: Any
-
-
 class Checkpoints(NamedTuple):
-    """A folder in which a training is resumed, to the bit with the same `every`, or a folder of such folders."""
+    """Where the last state of each training is kept, from which it resumes, to the bit with the same `every`."""
 
     folder: Path
     recipe: Mapping[str, Any]  # JSON values that determine the result: the model, the data, all settings
+    name: str = "training"  # of the checkpoint's folder, before the hash of the recipe
 
 
 @dataclass(frozen=True)
@@ -145,6 +58,38 @@ class Schedule:
     steps: int  # total number of updates, also of a resumed training
     every: int = 10  # steps from one validation, and checkpoint, to the next; the last step has both as well
     patience: int | None = None  # validations without a gain after which to stop; None = do all steps
+
+
+@dataclass(frozen=True)
+class State:
+    """All that a training knows: what a checkpoint holds."""
+
+    parameters: Any
+    best: Any  # parameters of the best validation
+    optimizer: Any  # state of the optimizer
+    history: tuple[Record, ...] = ()
+    losses: tuple[float, ...] = ()  # of the steps since the last record
+
+    @property
+    def arrays(self) -> tuple[Any, Any, Any]:
+        """The pytrees of arrays."""
+        return self.parameters, self.best, self.optimizer
+
+    @property
+    def step(self) -> int:
+        """Number of steps that are done."""
+        return (self.history[-1].step if self.history else 0) + len(self.losses)
+
+    @property
+    def best_record(self) -> Record:
+        """The first record with the smallest validation; the last record without validation."""
+        validations = [(record.validation, record.step, record) for record in self.history]
+        known = [each for each in validations if each[0] is not None]
+        return min(known)[-1] if known else self.history[-1]
+
+    def is_out_of(self, patience: int | None) -> bool:
+        """Whether so many validations had no gain."""
+        return patience is not None and len(self.history) - 1 - self.history.index(self.best_record) >= patience
 
 
 def fit(
@@ -167,13 +112,10 @@ def fit(
         track: progress over the steps.
 
     Raises:
-        InputError: the folder cannot be used, another process trains in it, or it has other files, or a checkpoint of
-            another training or of more steps.
+        InputError: the folder cannot be used, or has a checkpoint of more steps.
         TrainingError: loss, gradient, parameters or validation are not finite. The last checkpoint stays.
     """
     every, steps, patience = schedule.every, schedule.steps, schedule.patience
-    if every < 1 or steps < 0 or (patience is not None and (validate is None or patience < 1)):
-        raise ValueError(f"fit({steps=}, {every=}, {patience=}): expected counts, and a patience only with validate")
 
     @jax.jit
     def update(parameters: Any, memory: Any, batch: Any) -> tuple[Any, Any, Array, Array]:
@@ -184,63 +126,59 @@ def fit(
         finite = [jnp.all(jnp.isfinite(leaf)) for leaf in jax.tree.leaves((loss, gradient, parameters))]
         return parameters, _strong(memory), loss, jnp.all(jnp.stack(finite))
 
-    def add_record(state: _State, history: list[Record], losses: list[float]) -> tuple[_State, list[Record]]:
-        """Validate; return the state with the best parameters so far, and the history."""
-        step, loss = (history[-1].step + len(losses), float(np.mean(losses))) if history else (0, None)
+    def add_record(state: State) -> State:
+        loss = float(np.mean(state.losses)) if state.losses else None
         value = None if validate is None else float(validate(state.parameters))
         if value is not None and not math.isfinite(value):
-            raise _not_finite("the validation", step)
-        history = [*history, Record(step, loss, value)]
-        return state._replace(best=state.parameters) if _best(history) is history[-1] else state, history
+            raise _not_finite("the validation", state.step)
+        added = replace(state, history=(*state.history, Record(state.step, loss, value)), losses=())
+        return replace(added, best=state.parameters) if added.best_record is added.history[-1] else added
 
     parameters = _strong(parameters)
-    state = _State(parameters, parameters, _strong(schedule.optimizer.init(parameters)))
-    with _lock(checkpoints.folder) if checkpoints else nullcontext():
-        stored = restore(*checkpoints, state) if checkpoints else None
-        if stored:
-            state, (rows, losses) = _strong(stored[0]), stored[1]
-            history = [Record(*row) for row in rows]
-        else:
-            (state, history), losses = add_record(state, [], []), []
-        done = history[-1].step + len(losses)
-        if checkpoints and done > steps:
-            fix = "ask for more steps, or choose another folder"
-            raise InputError(
-                f"{checkpoints.folder}: this checkpoint is of step {done}, expected at most {steps}; {fix}"
-            )
-        remaining = 0 if _out_of_patience(history, patience) else steps - done
-        for step in track(range(done, done + remaining), remaining):
-            learned, memory, loss, is_finite = update(state.parameters, state.optimizer, batches(step))
-            if not is_finite:
-                raise _not_finite(f"the loss, a gradient or a parameter of batch {step}", step)
-            state, losses = _State(learned, state.best, memory), [*losses, float(loss)]
-            if is_due := (step + 1) % every == 0:
-                (state, history), losses = add_record(state, history, losses), []
-            if checkpoints and (is_due or step + 1 == steps):
-                save_checkpoint(checkpoints.folder, step + 1, checkpoints.recipe, state, (history, losses))
-            if _out_of_patience(history, patience):
-                break
-        if losses:  # after the checkpoint: a training of more steps would not validate here
-            state, history = add_record(state, history, losses)
-    is_early = _out_of_patience(history, patience)
-    ended = f"no gain in {patience} validations" if is_early else f"all {steps} steps are done"
-    return Fit(state.best, _best(history).step, tuple(history), ended)
+    state = State(parameters, parameters, _strong(schedule.optimizer.init(parameters)))
+    files = None
+    if checkpoints:
+        unpack = partial(_unpack, jax.tree.structure(state.arrays))
+        files = CacheFiles(checkpoints.folder, checkpoints.name, checkpoints.recipe, _pack, unpack)
+    state = (None if files is None else files.get(_KEY)) or add_record(state)
+    if state.step > steps:
+        got = f"the checkpoint in {checkpoints and checkpoints.folder} is of step {state.step}"
+        raise InputError(f"steps={steps}: {got}; ask for more steps, or choose another folder")
+    remaining = 0 if state.is_out_of(patience) else steps - state.step
+    for step in track(range(state.step, state.step + remaining), remaining):
+        learned, memory, loss, is_finite = update(state.parameters, state.optimizer, batches(step))
+        if not is_finite:
+            raise _not_finite(f"the loss, a gradient or a parameter of batch {step}", step)
+        state = replace(state, parameters=learned, optimizer=memory, losses=(*state.losses, float(loss)))
+        if is_due := state.step % every == 0:
+            state = add_record(state)
+        if files is not None and (is_due or state.step == steps):
+            files.update({_KEY: state})
+        if state.is_out_of(patience):
+            break
+    if state.losses:  # after the checkpoint: a training of more steps would not validate here
+        state = add_record(state)
+    ended = f"no gain in {patience} validations" if state.is_out_of(patience) else f"all {steps} steps are done"
+    return Fit(state.best, state.best_record.step, state.history, ended)
 
 
 def _not_finite(what: str, step: int) -> TrainingError:
     return TrainingError(f"step {step}: {what} is not finite; look at the data, or lower the learning rate")
 
 
-def _best(history: Sequence[Record]) -> Record:
-    """The first record with the smallest validation; the last record without validation."""
-    validations = [(record.validation, record.step, record) for record in history if record.validation is not None]
-    return min(validations)[-1] if validations else history[-1]
-
-
-def _out_of_patience(history: Sequence[Record], patience: int | None) -> bool:
-    return patience is not None and len(history) - 1 - history.index(_best(history)) >= patience
-
-
 def _strong(tree: Any) -> Any:
     """Arrays with strong types: a weak type would compile once more when a strong one takes its place."""
     return jax.tree.map(lambda leaf: jnp.asarray(leaf, dtype=jnp.result_type(leaf)), tree)
+
+
+def _pack(state: State) -> dict[str, np.ndarray]:
+    record = json.dumps([state.history, state.losses]).encode()
+    leaves = {str(place): np.asarray(leaf) for place, leaf in enumerate(jax.tree.leaves(state.arrays))}
+    return leaves | {"record": np.frombuffer(record, np.uint8)}
+
+
+def _unpack(structure: Any, arrays: Mapping[str, np.ndarray]) -> State:
+    history, losses = json.loads(arrays["record"].tobytes())
+    leaves = [arrays[str(place)] for place in range(len(arrays) - 1)]
+    parameters, best, optimizer = _strong(jax.tree.unflatten(structure, leaves))
+    return State(parameters, best, optimizer, tuple(Record(*row) for row in history), tuple(losses))

@@ -1,138 +1,45 @@
 """The first rows of the rankings of every query by every setting of a sweep.
 
 Settings are batch axes of one compiled call. Matches are scored pair by pair, whatever query they belong to. Work goes
-block by block (some settings, some queries): this bounds the memory. With a folder, the rows of each setting are kept
-in a file, and only settings that are missing are ranked.
+block by block (some settings), and some queries at a time, which bounds the memory. With a folder, the rows of each
+setting are kept in a file, and only settings that are missing are ranked.
 """
 
 import itertools
 import math
 import shutil
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import partial
+from functools import lru_cache
 from operator import itemgetter
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, TypeVar
 
-import jax
 import numpy as np
 from jaxtyping import Bool, Float, Int, Shaped
 
-from mfvpr.core import ranking
 from mfvpr.core.batch import MATCH_AXES, by_capacity, score_settings
 from mfvpr.core.scorer import check_host, static_names, whole_numbers, with_parameters, with_static_functions
-from mfvpr.core.types import Array, Shortlist
+from mfvpr.core.types import Shortlist
 from mfvpr.core.weights import ChosenWeight
 from mfvpr.datasets.datasets import Dataset
 from mfvpr.datasets.positives import Positives
 from mfvpr.evaluation.drives import DriveFilter
 from mfvpr.evaluation.protocol import EvaluationProtocol, Half
-from mfvpr.evaluation.rankings import Ranked, RetrievalScore, Ties, breaks_ties_by_row, fuse, retrieval_scores
+from mfvpr.evaluation.rankings import Ranked, RetrievalScore, Scores, Ties, fuse_shortlist
 from mfvpr.evaluation.stages import PaddedBatch, all_batches, fuse_all, require_finite, run_batches
 from mfvpr.matchers.match_set import MatchSet, Scales, partition, queries_that_fit, scales
 from mfvpr.storage.cache_files import CacheFiles
-from mfvpr.utils.errors import InputError
 from mfvpr.utils.fingerprints import content_hash, fingerprint, recipe_of, versions
-from mfvpr.utils.numerics import Device, compiled
+from mfvpr.utils.numerics import Device
 from mfvpr.utils.runtime import DEFAULT_RUNTIME, Runtime
 
 Setting = Mapping[str, Any]
+Views = Sequence[Bool[np.ndarray, "queries candidates"]]
+Item = TypeVar("Item")
 
 FUSION = "c"
-
-
-@dataclass(frozen=True)
-class Group:
-    """Settings of one program, the product of G settings and W weightings."""
-
-    scorer: Any  # with the choices and the capacity for these settings
-    settings: Mapping[str, Shaped[np.ndarray, " settings"]]
-    weightings: Mapping[str, Shaped[np.ndarray, " weightings"]]  # of `weight` (an option's number) and `max_distance`
-    rows: Int[np.ndarray, "settings weightings"]  # numbers of the settings
-
-    def blocks(self, size: int) -> Iterator["Group"]:
-        """Parts of one shape with at most `size` settings each; the last part repeats settings to reach the shape."""
-        width = min(size, self.rows.shape[1])
-        for columns in _parts(self.rows.shape[1], width):
-            for lines in _parts(self.rows.shape[0], max(1, size // width)):
-                settings = {name: values[lines] for name, values in self.settings.items()}
-                weightings = {name: values[columns] for name, values in self.weightings.items()}
-                yield replace(self, settings=settings, weightings=weightings, rows=self.rows[np.ix_(lines, columns)])
-
-
-def grid(axes: Mapping[str, Sequence[Any]]) -> list[dict[str, Any]]:
-    """Every combination of the axes' values, the last axis fastest."""
-    return [dict(zip(axes, values, strict=True)) for values in itertools.product(*axes.values())]
-
-
-def distinct(settings: Sequence[Setting]) -> tuple[list[dict[str, Any]], list[list[int]]]:
-    """Settings with different scores, without `c`, and for each the places in `settings` that share its scores."""
-    by_scores = _group_by(settings, range(len(settings)), lambda name, _: name != FUSION)
-    return [setting for setting, _ in by_scores], [places for _, places in by_scores]
-
-
-def group_by_program(
-    scorer: Any, settings: Sequence[Setting], image_sizes: tuple[np.ndarray, np.ndarray]
-) -> Iterator[Group]:
-    """Group settings, with the same names in each, by program: each value of a static parameter, and None, has one."""
-    static, integers = static_names(scorer), whole_numbers(scorer)
-    weights = list({id(s["weight"]): s["weight"] for s in settings if "weight" in s}.values())
-    by_choices = _group_by(settings, range(len(settings)), lambda name, value: name in static or value is None)
-    for choices, members in by_choices:
-        chosen = with_parameters(scorer, choices)
-        if weights:
-            chosen = replace(chosen, weight=ChosenWeight(tuple(weights), 0))
-        chosen = with_static_functions(chosen)
-        # Split the members into products `[G, W]` of settings and weightings.
-        columns = _group_by(settings, members, lambda name, _: name in MATCH_AXES)
-        column = {row: place for place, (_, rows) in enumerate(columns) for row in rows}
-        products: dict[tuple[int, ...], list[list[int]]] = {}
-        for _, line in _group_by(settings, members, lambda name, _: name not in MATCH_AXES):
-            line = sorted(line, key=column.__getitem__)
-            products.setdefault(tuple(column[row] for row in line), []).append(line)
-        for rows in map(np.array, products.values()):
-            values = _arrays([settings[row] for row in rows[:, 0]], weights, integers, without={*choices, *MATCH_AXES})
-            parameter_names = set(settings[0]) - set(MATCH_AXES)
-            weightings = _arrays([settings[row] for row in rows[0]], weights, integers, without=parameter_names)
-            for fitted, part in by_capacity(chosen, values, len(rows), *image_sizes):
-                yield Group(fitted, {name: axis[part] for name, axis in values.items()}, weightings, rows[part])
-
-
-def _group_by(
-    settings: Sequence[Setting], members: Sequence[int], chosen: Callable[[str, Any], bool]
-) -> list[tuple[dict, list[int]]]:
-    """Group the members by the values of the chosen names; return the values and the members of each group."""
-    groups: dict[Any, tuple[dict, list[int]]] = {}
-    for row in members:
-        shared = {name: value for name, value in settings[row].items() if chosen(name, value)}
-        key = tuple((name, id(value) if name == "weight" else value) for name, value in shared.items())
-        groups.setdefault(key, (shared, []))[1].append(row)
-    return list(groups.values())
-
-
-def _arrays(
-    settings: Sequence[Setting], weights: Sequence[Any], integers: set[str], *, without: set[str]
-) -> dict[str, np.ndarray]:
-    """Values `[n]` by name; a match weight is its number among `weights`."""
-    number = {id(weight): place for place, weight in enumerate(weights)}
-    names = [name for name in settings[0] if name not in without]
-    return {
-        name: np.array([number[id(setting[name])] for setting in settings])
-        if name == "weight"
-        else np.array([setting[name] for setting in settings], int if name in integers else np.float32)
-        for name in names
-    }
-
-
-def _parts(total: int, size: int) -> list[np.ndarray]:
-    """Parts of range(total) of one length, at most `size`; the last part repeats its last number."""
-    length = -(-total // -(-total // size))
-    return [np.minimum(np.arange(start, start + length), total - 1) for start in range(0, total, length)]
-
-
 SETTINGS_PER_BLOCK = 64
-ALONE = "alone"  # the c of a score that is not fused
 
 
 @dataclass(frozen=True)
@@ -155,15 +62,15 @@ class DriveRanking:
 
     def rows(self, ranked: Ranked, view: int) -> Int[np.ndarray, "queries candidates"]:
         """Rows of a view's rankings, -1 where none are ranked."""
-        excluded = None if self.excluded is None else self.excluded.dense()
-        if not view:
-            return self.drive_filter(ranked, self.num_rows, excluded).rows
-        half, rows = self.halves[view - 1], np.full_like(ranked.rows, -1)
-        unseen = np.broadcast_to(~half.allowed, (len(half.tune), self.num_rows))
-        unseen = unseen if excluded is None else unseen | excluded[half.tune]
-        tuned = Ranked(ranked.rows[half.tune], ranked.scores[half.tune])
-        ranking = self.drive_filter(tuned, self.num_rows, unseen).rows
-        rows[half.tune, : ranking.shape[1]] = ranking
+        queries, allowed = np.arange(len(ranked.rows)), np.ones(self.num_rows, bool)
+        if view:
+            queries, allowed = self.halves[view - 1].tune, self.halves[view - 1].allowed
+        hidden = np.tile(~allowed, (len(queries), 1))
+        if self.excluded is not None:
+            hidden |= self.excluded.dense(queries)
+        ranking = self.drive_filter(Ranked(ranked.rows[queries], ranked.scores[queries]), self.num_rows, hidden)
+        rows = np.full_like(ranked.rows, -1)
+        rows[queries, : ranking.rows.shape[1]] = ranking.rows
         return rows
 
 
@@ -178,7 +85,7 @@ class SweepOptions:
     ks: Sequence[int] = (1, 5, 10)  # depths of the recall; the largest is the number of rows of a ranking
     ties: Ties = "retrieval"  # see `mfvpr.evaluation.rankings.rank_shortlist`
     retrieval_score: RetrievalScore = "cosine"  # see `mfvpr.evaluation.rankings.retrieval_scores`
-    sequence: DriveRanking | None = None  # ranks the queries of a drive together, in one block; None = each alone
+    sequence: DriveRanking | None = None  # ranks the queries of a drive together; None = each alone
     settings_per_block: int | None = None  # None = 64
     queries_per_block: int | None = None  # None = as many as fit into 256 MB
     folder: Path | None = None  # where the rows of each setting are kept, and read by later sweeps; None = nowhere
@@ -195,7 +102,7 @@ def rank_settings(
     match_set: MatchSet | Scales,
     candidates: Shortlist,
     *,
-    views: Sequence[Bool[np.ndarray, "queries candidates"]] | None = None,
+    views: Views | None = None,
     options: SweepOptions = DEFAULT_OPTIONS,
 ) -> Int[np.ndarray, "views settings queries depth"]:
     """Database rows of the first candidates of every query's ranking by every setting, best first, -1 = none.
@@ -215,123 +122,64 @@ def rank_settings(
         InputError: a setting that cannot be scored, or the folder cannot be used.
     """
     check_host(scorer)
-    views = [candidates.mask] if views is None else views
+    views = [view & candidates.mask for view in views or [candidates.mask]]
     num_queries, at_once = len(candidates.mask), min(options.settings_per_block or SETTINGS_PER_BLOCK, len(settings))
     size = num_queries if options.sequence else options.queries_per_block or queries_that_fit(match_set, at_once)
-    rows = np.full((len(views), len(settings), num_queries, max(options.ks)), -1, np.int32)
-    files, recipes = _files(scorer, options, settings)
-    parts, total = list[_Part](), 0  # total: batches of pairs for all blocks
-    for start in range(0, num_queries, max(1, size)):
-        queries = range(num_queries)[start : start + size]
-        part = slice(queries.start, queries.stop)
-        shortlist = jax.tree.map(lambda values: values[part], candidates)  # noqa: B023
-        seen = [view[part] & shortlist.mask for view in views]
-        keys, missing = list[str](), range(len(settings))
-        if files is not None:
-            fusion = (match_set.weights, match_set.normalize) if isinstance(match_set, Scales) else ()
-            of_scales = [scale.take(queries) for scale in scales(match_set)]
-            digest = content_hash(fusion, [(each.counts, each.matches) for each in of_scales], shortlist, seen)
-            keys, missing = [fingerprint([recipe, digest]) for recipe in recipes], list[int]()
-            for number, key in enumerate(keys):
-                if (found := files.get(key)) is None:
-                    missing.append(number)
-                else:
-                    rows[:, number, part] = found
-        if not missing:
-            continue
-        unique, places = distinct([settings[number] for number in missing])
-        groups = list(group_by_program(scorer, unique, match_set.image_sizes))
-        blocks = [block for group in groups for block in group.blocks(at_once)]
-        share = len(unique) / len(groups)
-        total += len(blocks) * sum(len(partition(each, queries, settings=share)) for each in scales(match_set))
-        numbers = [[missing[place] for place in each] for each in places]
-        parts.append(_Part(queries, shortlist, seen, keys, numbers, blocks, share))
+    parts = [range(num_queries)[start : start + size] for start in range(0, num_queries, max(1, size))]
+    rows = np.full((len(settings), len(views), num_queries, max(options.ks)), -1, np.int32)
+    files, missing = _files(scorer, settings, match_set, candidates, views, options), list[int]()
+    for number, setting in enumerate(settings):
+        kept = None if files is None else files.get(fingerprint(recipe_of(setting)))
+        if kept is None:
+            missing.append(number)
+        else:
+            rows[number] = kept
 
+    # Settings that differ in c alone share their scores.
+    names = [name for name in settings[0] if name != FUSION]
+    by_score = list(_group(missing, lambda number: _items(settings[number], names)).values())
+    scored = [{name: settings[first][name] for name in names} for first, *_ in by_score]
+    groups = list(group_by_program(scorer, scored, match_set.image_sizes))
+    share = len(scored) / len(groups) if groups else 1  # settings of a program: with more, batches are smaller
+    pairs = f"{int(candidates.mask.sum()):,} pairs of {num_queries:,} queries with their candidates"
+    options.runtime.log(f"{options.label}: {len(missing):,} of {len(settings):,} settings to do on {pairs}")
+    blocks = [block for group in groups for block in group.blocks(at_once)]
+    batches_of = lru_cache(maxsize=1)(lambda queries: list(all_batches(match_set, queries, settings=share)))
+    batches_of_block = sum(len(partition(each, part, settings=share)) for part in parts for each in scales(match_set))
+    total = len(blocks) * batches_of_block
     ticks = iter(options.runtime.progress(options.label)(range(total), total))
-    for part in parts:
-        batches = list(all_batches(match_set, part.queries, settings=part.share))
-        shape = len(scales(match_set)), *part.candidates.mask.shape
-        place = slice(part.queries.start, part.queries.stop)
-        for block in part.blocks:
-            of_block, firsts = np.unique(block.rows, return_index=True)  # the last block of a program repeats settings
-            scores = block_scores(block, batches, shape, options.runtime.devices, ticks)[:, firsts]
-            numbers = [number for row in of_block for number in part.numbers[row]]
-            repeats = [len(part.numbers[row]) for row in of_block]
-            cs = [settings[number].get(FUSION, ALONE) for number in numbers]
-            for view, seen in enumerate(part.views):
-                fused = np.repeat(fuse_all(match_set, scores, seen), repeats, axis=0)
-                rows[view, numbers, place] = _first_rows(fused, cs, part.candidates, seen, view, options)
-            if files is not None:
-                files.update({part.keys[int(number)]: rows[:, number, place] for number in numbers})
+    for block in blocks:
+        of_block, firsts = np.unique(block.rows, return_index=True)  # the last block of a program repeats settings
+        for queries in parts:
+            part = slice(queries.start, queries.stop)
+            shape = len(scales(match_set)), len(queries), candidates.mask.shape[1]
+            scores = block_scores(block, batches_of(queries), shape, options.runtime.devices, ticks)[:, firsts]
+            for view, mask in enumerate(views):
+                seen = Shortlist(candidates.indices[part], candidates.scores[part], mask[part])
+                for row, of_setting in zip(of_block, fuse_all(match_set, scores, seen.mask), strict=True):
+                    for number in by_score[row]:
+                        first = _first_rows(seen, of_setting, settings[number], view, options)
+                        rows[number, view, part, : first.shape[1]] = first
+        if files is not None:
+            ranked = [number for row in of_block for number in by_score[row]]
+            files.update({fingerprint(recipe_of(settings[number])): rows[number] for number in ranked})
     next(ticks, None)  # ends the progress
-    return rows
-
-
-class _Part(NamedTuple):
-    """Some queries of a sweep, and the settings by which they are not ranked yet."""
-
-    queries: range
-    candidates: Shortlist
-    views: Sequence[np.ndarray]
-    keys: Sequence[str]  # of the files of all settings
-    numbers: Sequence[Sequence[int]]  # of the settings of each score, which differ in c
-    blocks: Sequence[Group]  # of the scores
-    share: float  # scores of a program, on average: with more, batches are smaller
-
-
-def _files(
-    scorer: Any, options: SweepOptions, settings: Sequence[Setting] = ()
-) -> tuple[CacheFiles[np.ndarray] | None, list[Any]]:
-    """Files of rows, by what determines them but for setting and data, and recipes of the settings; None without."""
-    if options.folder is None:
-        return None, []
-    of_rows = max(options.ks), options.ties, options.retrieval_score, options.sequence
-    try:
-        recipe = {"scorer": recipe_of(scorer), "rows": recipe_of(of_rows), "versions": recipe_of(versions())}
-        recipes = [recipe_of(setting) for setting in settings]
-    except (TypeError, InputError) as error:
-        options.runtime.log(f"{options.label}: no results are kept in {options.folder}, as there is no recipe: {error}")
-        return None, []
-    pack, unpack = lambda rows: {"rows": rows}, itemgetter("rows")
-    return CacheFiles(options.folder, "sweep", recipe, pack, unpack, compress=True), recipes
-
-
-def forget_rankings(scorer: Any, options: SweepOptions) -> None:
-    """Remove the rankings that a sweep kept in its folder: when it is finished, changed code may rank otherwise."""
-    if (files := _files(scorer, options)[0]) is not None:
-        shutil.rmtree(files.folder, ignore_errors=True)
+    return np.moveaxis(rows, 1, 0)
 
 
 def _first_rows(
-    scores: Float[np.ndarray, "settings queries candidates"],
-    cs: Sequence[Any],
-    candidates: Shortlist,
-    view: Bool[np.ndarray, "queries candidates"],
-    number: int,
-    options: SweepOptions,
-) -> Int[np.ndarray, "settings queries depth"]:
-    """Database rows by the scores of settings, each fused with its own c, in the view of a number."""
-    by_retrieval = retrieval_scores(candidates, options.retrieval_score)
-    tie_break = candidates.indices if breaks_ties_by_row(options.ties) else None
-    rows = np.full((*scores.shape[:2], max(options.ks)), -1, np.int32)
-    kinds = np.array([ALONE if c == ALONE else "balanced" if c is None else "given" for c in cs])
-    for kind in np.unique(kinds):
-        members = np.flatnonzero(kinds == kind)
-        c = np.array([cs[member] for member in members.tolist()], np.float32) if kind == "given" else None
-        orders = _orders(by_retrieval, scores[members], c, view, tie_break, fused=kind != ALONE)
-        order, final = map(np.asarray, orders)
-        is_seen = np.take_along_axis(view[None], order, -1)
-        ranked = np.where(is_seen, np.take_along_axis(candidates.indices[None], order, -1), -1)
-        if options.sequence is not None:
-            pairs = zip(ranked, np.take_along_axis(final, order, -1), strict=True)
-            ranked = np.stack([options.sequence.rows(Ranked(*pair), number) for pair in pairs])
-        ranked = ranked[..., : max(options.ks)]
-        rows[members, :, : ranked.shape[-1]] = ranked
-    return rows
+    candidates: Shortlist, scores: Scores, setting: Setting, view: int, options: SweepOptions
+) -> Int[np.ndarray, "queries _"]:
+    """Database rows by the scores of a setting, fused with its c, among the candidates of a view."""
+    if FUSION in setting:
+        scores = fuse_shortlist(candidates, scores, setting[FUSION], retrieval_score=options.retrieval_score)
+    ranked = Ranked.of(candidates, scores, options.ties)
+    rows = ranked.rows if options.sequence is None else options.sequence.rows(ranked, view)
+    return rows[:, : max(options.ks)]
 
 
 def block_scores(
-    block: Group,
+    block: "Group",
     batches: Sequence[PaddedBatch],
     shape: tuple[int, int, int],
     devices: Sequence[Device] | None,
@@ -349,15 +197,111 @@ def block_scores(
     return np.moveaxis(scores.reshape(-1, *shape), 1, 0)
 
 
-@partial(compiled, static_argnames="fused")
-def _orders(
-    by_retrieval: Array, scores: Array, c: Array | None, view: Array, tie_break: Array | None, *, fused: bool
-) -> tuple[Array, Array]:
-    """Positions `[W, q, C]` into the shortlist, best first, and the final scores, one setting at a time."""
+def _files(
+    scorer: Any,
+    settings: Sequence[Setting],
+    match_set: MatchSet | Scales,
+    candidates: Shortlist,
+    views: Views,
+    options: SweepOptions,
+) -> CacheFiles[np.ndarray] | None:
+    """Files of rows `[views, queries, depth]` by setting, in a folder named by what is swept; None if none are kept."""
+    if options.folder is None:
+        return None
+    try:
+        recipe_of(settings)
+        recipe = {"scorer": recipe_of(scorer), "versions": recipe_of(versions())}
+        recipe["rows"] = recipe_of([max(options.ks), options.ties, options.retrieval_score, options.sequence])
+    except TypeError as error:
+        options.runtime.log(f"{options.label}: no results are kept in {options.folder}, as there is no recipe: {error}")
+        return None
+    fusion = f"scales of {match_set.weights}" if isinstance(match_set, Scales) else "one scale"
+    matches = [[content_hash(query) for query in scale.matches] for scale in scales(match_set)]
+    recipe["data"] = content_hash(fusion, matches, [scale.counts for scale in scales(match_set)], candidates, views)
+    pack, unpack = lambda rows: {"rows": rows}, itemgetter("rows")
+    return CacheFiles(options.folder, "sweep", recipe, pack, unpack, compress=True)
 
-    def order(scores_c: tuple[Array, Array | None]) -> tuple[Array, Array]:
-        scores, c = scores_c
-        scores = fuse(by_retrieval, scores, view, c) if fused else scores
-        return ranking.rank(scores, view, tie_break=tie_break), scores
 
-    return jax.lax.map(order, (scores, c))
+def forget_rankings(
+    scorer: Any, match_set: MatchSet | Scales, candidates: Shortlist, views: Views, options: SweepOptions
+) -> None:
+    """Remove the rows that a sweep kept in its folder: when it is finished, changed code may rank otherwise."""
+    if (files := _files(scorer, [], match_set, candidates, views, options)) is not None:
+        shutil.rmtree(files.folder, ignore_errors=True)
+
+
+def grid(axes: Mapping[str, Sequence[Any]]) -> list[dict[str, Any]]:
+    """Every combination of the axes' values, the last axis fastest."""
+    return [dict(zip(axes, values, strict=True)) for values in itertools.product(*axes.values())]
+
+
+@dataclass(frozen=True)
+class Group:
+    """Settings of one program, the product of G settings and W weightings."""
+
+    scorer: Any  # with the choices and the capacity for these settings
+    settings: Mapping[str, Shaped[np.ndarray, " settings"]]
+    weightings: Mapping[str, Shaped[np.ndarray, " weightings"]]  # of `weight` (an option's number) and `max_distance`
+    rows: Int[np.ndarray, "settings weightings"]  # numbers of the settings
+
+    def blocks(self, size: int) -> Iterator["Group"]:
+        """Parts of one shape with at most `size` settings each; the last part repeats settings to reach the shape."""
+        width = min(size, self.rows.shape[1])
+        for columns in _parts(self.rows.shape[1], width):
+            for lines in _parts(self.rows.shape[0], max(1, size // width)):
+                settings = {name: values[lines] for name, values in self.settings.items()}
+                weightings = {name: values[columns] for name, values in self.weightings.items()}
+                yield replace(self, settings=settings, weightings=weightings, rows=self.rows[np.ix_(lines, columns)])
+
+
+def group_by_program(
+    scorer: Any, settings: Sequence[Setting], image_sizes: tuple[np.ndarray, np.ndarray]
+) -> Iterator[Group]:
+    """Group settings, with the same names in each, by program: each value of a static parameter, and None, has one."""
+    static, integers = static_names(scorer), {*whole_numbers(scorer), "weight"}
+    weights = list({id(setting["weight"]): setting["weight"] for setting in settings if "weight" in setting}.values())
+    number = {id(weight): place for place, weight in enumerate(weights)}
+
+    def arrays(rows: Iterable[int], names: Iterable[str]) -> dict[str, np.ndarray]:
+        """Values by name; a match weight is its number among `weights`."""
+        columns = {name: [settings[row][name] for row in rows] for name in names}
+        if "weight" in columns:
+            columns["weight"] = [number[id(weight)] for weight in columns["weight"]]
+        return {name: np.array(column, int if name in integers else np.float32) for name, column in columns.items()}
+
+    is_choice = lambda name, value: name in static or value is None  # noqa: E731
+    choices_of = lambda setting: [name for name, value in setting.items() if is_choice(name, value)]  # noqa: E731
+    by_choices = _group(range(len(settings)), lambda row: _items(settings[row], choices_of(settings[row])))
+    for choices, members in by_choices.items():
+        chosen = with_parameters(scorer, dict(choices))
+        if weights:
+            chosen = replace(chosen, weight=ChosenWeight(tuple(weights), 0))
+        chosen = with_static_functions(chosen)
+        # Split the members into products `[G, W]` of settings and weightings.
+        names = [name for name in settings[members[0]] if name not in dict(choices)]
+        inner, outer = ([name for name in names if (name in MATCH_AXES) == is_inner] for is_inner in (True, False))
+        lines = _group(members, lambda row: _items(settings[row], outer)).values()  # noqa: B023
+        products = _group(lines, lambda line: tuple(_items(settings[row], inner) for row in line))  # noqa: B023
+        for rows in map(np.array, products.values()):
+            values, weightings = arrays(rows[:, 0], outer), arrays(rows[0], inner)
+            for fitted, part in by_capacity(chosen, values, len(rows), *image_sizes):
+                yield Group(fitted, {name: axis[part] for name, axis in values.items()}, weightings, rows[part])
+
+
+def _items(setting: Setting, names: Iterable[str]) -> tuple[tuple[str, Any], ...]:
+    """Names and values to compare; match weights are equal if they are the same object."""
+    return tuple((name, id(setting[name]) if name == "weight" else setting[name]) for name in names)
+
+
+def _group(items: Iterable[Item], key: Callable[[Item], Any]) -> dict[Any, list[Item]]:
+    """Items by key, in order."""
+    groups: dict[Any, list[Item]] = {}
+    for item in items:
+        groups.setdefault(key(item), []).append(item)
+    return groups
+
+
+def _parts(total: int, size: int) -> list[np.ndarray]:
+    """Parts of range(total) of one length, at most `size`; the last part repeats its last number."""
+    length = -(-total // -(-total // size))
+    return [np.minimum(np.arange(start, start + length), total - 1) for start in range(0, total, length)]

@@ -33,8 +33,12 @@ from mfvpr.tuning.sweeps.setting_rankings import DEFAULT_OPTIONS, FUSION, Settin
 from mfvpr.utils.errors import InputError
 from mfvpr.utils.fields import Setting as Declared
 
+if TYPE_CHECKING:
+    import optuna
+
 MAX_DISTANCE = "max_distance"
 CAPACITY = ("bin_size", "align")  # parameters that determine the number of bins
+BATCH = 16  # settings of one compiled call, after which Optuna gets their recalls
 
 
 @dataclass(frozen=True)
@@ -49,7 +53,8 @@ class Axes:
             of the fusion with retrieval ("auto" = balanced). Values of declared fields are plain
             (`mfvpr.core.scorer`: a weight is the word `fs`, no limit is None). Words stand for weights in every
             scorer.
-        own: by name, the plain value without a sweep. Default: the scorer's, no limit of `max_distance`, and c = 0.
+        own_values: by name, the plain value without a sweep. Default: the scorer's, no limit of `max_distance`, and
+            c = 0.
 
     Raises:
         InputError: an axis without values or with equal ones, an unknown word, or a name that the scorer does not have.
@@ -57,7 +62,7 @@ class Axes:
 
     scorer: Scorer
     values: Mapping[str, Sequence[Any]]
-    own: Mapping[str, Any] = field(default_factory=dict)
+    own_values: Mapping[str, Any] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         scorer = self.scorer
@@ -73,14 +78,14 @@ class Axes:
             values[name] = list(map(_plain, axis)) if is_list else []
             if len({*values[name]}) < max(1, len(values[name])):
                 raise InputError(f"{name}={axis!r}: expected different values, in a list")
-        own = {name: self.own[name] if name in self.own else self._own(name) for name in values}
+        given = self.own_values
         object.__setattr__(self, "values", values)
-        object.__setattr__(self, "own", own)
-        for name, axis in values.items():  # before any work
-            for value in axis:
-                setting = self.setting({name: value})
-                if name in self.parameters and type(scorer) in SCORERS.values():
-                    check_bounds(with_parameters(scorer, setting))
+        own_values = {name: given[name] if name in given else self._own_value(name) for name in values}
+        object.__setattr__(self, "own_values", own_values)
+        for name, value in ((name, value) for name, axis in values.items() for value in axis):  # before any work
+            setting = self.setting({name: value})
+            if name in self.parameters and type(scorer) in SCORERS.values():
+                check_bounds(with_parameters(scorer, setting))
 
     @property
     def parameters(self) -> Mapping[str, Declared]:
@@ -96,28 +101,17 @@ class Axes:
         """Every combination of the plain values."""
         return grid(self.values)
 
-    def without(self, name: str) -> "Axes":
-        """All axes but one."""
-        return Axes(self.scorer, {key: value for key, value in self.values.items() if key != name}, self.own)
-
     def setting(self, plain: Mapping[str, Any]) -> Setting:
         """Convert plain values to a setting of `mfvpr.tuning.sweeps.rank_settings`."""
-        special: dict[str, Callable[[Any], Any]] = {
+        converters: dict[str, Callable[[Any], Any]] = {
+            **{name: parameter.value for name, parameter in self.parameters.items()},
             FUSION: lambda c: None if c == "auto" else float(c),
             MAX_DISTANCE: lambda limit: math.inf if limit is None else limit,
             "weight": named_weight,
         }
-        declared = {name: parameter.value for name, parameter in self.parameters.items()}
-        converters = declared | special
-        return {name: converters.get(name, lambda value: value)(value) for name, value in plain.items()}
+        return {name: converters[name](value) if name in converters else value for name, value in plain.items()}
 
-    def check(self, image_sizes: tuple[np.ndarray, np.ndarray]) -> None:
-        """Raise an InputError before any work if a histogram of these `MatchSet.image_sizes` has too many bins."""
-        for setting in grid({name: self.values[name] for name in CAPACITY if name in self.values}):
-            fit_capacities(with_parameters(self.scorer, setting), *image_sizes)
-
-    def _own(self, name: str) -> Any:
-        """The plain value without a sweep."""
+    def _own_value(self, name: str) -> Any:
         if name in (MAX_DISTANCE, FUSION):
             return None if name == MAX_DISTANCE else 0
         value = attrgetter(name)(self.scorer)
@@ -136,12 +130,6 @@ def can_learn(scorer: Any) -> bool:
 def _plain(value: Any) -> Any:
     """The number that a scalar array holds; any other value as it is."""
     return value.item() if isinstance(value, np.generic | np.ndarray | jax.Array) else value
-
-
-if TYPE_CHECKING:
-    import optuna
-
-BATCH = 16  # settings of one compiled call, after which Optuna gets their recalls
 
 
 class Verdict(NamedTuple):
@@ -174,7 +162,7 @@ class Outcome:
     @property
     def own(self) -> int:
         """Number of the setting with the scorer's own values."""
-        return self.settings.index(dict(self.axes.own))
+        return self.settings.index(dict(self.axes.own_values))
 
     @cached_property
     def _tuning(self) -> Float[np.ndarray, "halves settings"]:
@@ -187,16 +175,12 @@ class Outcome:
     @cached_property
     def chosen(self) -> list[int]:
         """Number of the best setting, for each half."""
-        return [best_setting(recall, self._grid) for recall in self._tuning]
+        return [best_setting(recall, self.axes.values if self.is_grid else None) for recall in self._tuning]
 
     @cached_property
     def best(self) -> int:
         """Number of the best setting by the mean recall of the halves."""
-        return best_setting(self._tuning.mean(axis=0), self._grid)
-
-    @property
-    def _grid(self) -> Mapping[str, Sequence[Any]] | None:
-        return self.axes.values if self.is_grid else None
+        return best_setting(self._tuning.mean(axis=0), self.axes.values if self.is_grid else None)
 
     @cached_property
     def report(self) -> list[Verdict]:
@@ -218,11 +202,10 @@ def search_grid(
     options: SweepOptions = DEFAULT_OPTIONS,
 ) -> Outcome:
     """Rank with every setting of a grid, and with the scorer's own values if the grid does not have them."""
-    axes.check(match_set.image_sizes)
     protocol, settings = protocol.of(candidates), axes.grid()
-    settings += [] if dict(axes.own) in settings else [dict(axes.own)]
-    _announce(len(settings), candidates, options)
-    rows = _rank(axes, settings, protocol, match_set, candidates, options)
+    settings += [] if dict(axes.own_values) in settings else [dict(axes.own_values)]
+    of_scorer = list(map(axes.setting, settings))
+    rows = rank_settings(axes.scorer, of_scorer, match_set, candidates, views=protocol.views, options=options)
     return Outcome(axes, protocol, settings, rows, sorted({*options.ks}), is_grid=True)
 
 
@@ -244,42 +227,26 @@ def search_optuna(
     require_optuna()
     import optuna
 
-    axes.check(match_set.image_sizes)
-    protocol = protocol.of(candidates)
-    _announce(1 + trials, candidates, options)
+    for setting in grid({name: axes.values[name] for name in CAPACITY if name in axes.values}):  # before any work
+        fit_capacities(with_parameters(axes.scorer, setting), *match_set.image_sizes)
+    protocol, settings = protocol.of(candidates), [dict(axes.own_values)]
+
+    def rank(settings: list[dict[str, Any]], label: str) -> np.ndarray:
+        of_scorer, labeled = list(map(axes.setting, settings)), replace(options, label=label)
+        return rank_settings(axes.scorer, of_scorer, match_set, candidates, views=protocol.views, options=labeled)
+
     optuna.logging.set_verbosity(optuna.logging.WARNING)
     study = optuna.create_study(direction="maximize", sampler=optuna.samplers.TPESampler(seed=seed))
-    settings = [dict(axes.own)]
-    rows = [_rank(axes, settings, protocol, match_set, candidates, replace(options, label="own values"))]
+    rows = [rank(settings, "own values")]
     while (done := len(settings) - 1) < trials:
         batch = [study.ask() for _ in range(min(BATCH, trials - done))]
         proposed = [suggest_setting(trial, axes) for trial in batch]
-        label = f"trials {done + 1} to {done + len(batch)} of {trials}"
-        rows.append(_rank(axes, proposed, protocol, match_set, candidates, replace(options, label=label)))
+        rows.append(rank(proposed, f"trials {done + 1} to {done + len(batch)} of {trials}"))
         recall = protocol.tuning(rows[-1])[..., protocol.main].mean(axis=0)
         for trial, value in zip(batch, recall, strict=True):
             study.tell(trial, float(value))
         settings += proposed
     return Outcome(axes, protocol, settings, np.concatenate(rows, axis=1), sorted({*options.ks}), is_grid=False)
-
-
-def _rank(
-    axes: Axes,
-    settings: Sequence[Mapping[str, Any]],
-    protocol: EvaluationProtocol,
-    match_set: MatchSet | Scales,
-    candidates: Shortlist,
-    options: SweepOptions,
-) -> Int[np.ndarray, "views settings queries depth"]:
-    """Rows of the rankings by plain settings."""
-    of_scorer = [axes.setting(plain) for plain in settings]
-    return rank_settings(axes.scorer, of_scorer, match_set, candidates, views=protocol.views, options=options)
-
-
-def _announce(number: int, candidates: Shortlist, options: SweepOptions) -> None:
-    pairs, queries = int(candidates.mask.sum()), len(candidates.mask)
-    words = f"{number:,} settings on {pairs:,} pairs of {queries:,} queries with their candidates"
-    options.runtime.log(f"sweep: {words}, {number * pairs:,} scores")
 
 
 def require_optuna() -> None:

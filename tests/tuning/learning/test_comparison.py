@@ -8,19 +8,15 @@ import numpy as np
 import optax
 import pytest
 
-from mfvpr import AggregatedScore, HistogramOfShifts, InputError, MatchCount, RatioWeight, Runtime, score_candidates
-from mfvpr.baselines.learned_weight import ABSOLUTE, RELATIVE, LearnedWeight
+from mfvpr import AggregatedScore, HistogramOfShifts, InputError, MatchCount, RatioWeight, score_candidates
+from mfvpr.baselines.learned_weight import ABSOLUTE, LearnedWeight
 from mfvpr.tuning.learning import comparison
 from mfvpr.tuning.learning.models import (
     LOSSES,
-    TEACHER_SIGMA,
     Model,
     Options,
     cross_entropy,
-    first_numbers,
     mean_loss,
-    of_matches,
-    start,
 )
 from mfvpr.tuning.learning.splits import Batch
 from mfvpr.tuning.learning.training import Schedule, fit
@@ -60,26 +56,6 @@ def test_candidates_are_right_wrong_or_of_no_account(half):
     assert not batch.mask[len(at.train) :].any()
 
 
-def test_statistics_of_a_learned_weight_are_of_nothing_hidden():
-    """Distances of hidden candidates, and of candidates of no account, are moved out of range: nothing changes."""
-
-    def weight(at):
-        return start(at, AggregatedScore(), OPTIONS, learned_weight=True).start["weight"]
-
-    at = split()
-    moved = []
-    for query, flat in enumerate(at.match_set.matches):
-        there = np.repeat(at.usable[query], at.match_set.counts[query]) & (query in at.train)
-        moved.append(replace(flat, distance=np.where(there, flat.distance, np.float32(50))))
-    far = replace(at, match_set=replace(at.match_set, matches=moved))
-    jax.tree.map(np.testing.assert_array_equal, weight(far), weight(at))
-    distances = np.concatenate([
-        at.match_set.matches[query].distance[np.repeat(at.usable[query], at.match_set.counts[query])]
-        for query in at.train[np.linspace(0, len(at.train) - 1, 4).astype(int)]
-    ])  # fmt: skip
-    assert weight(at).center[ABSOLUTE.index("distance")] == pytest.approx(distances.mean(), rel=1e-5)
-
-
 HISTOGRAM = HistogramOfShifts(bin_size=20.0, sigma=20.0)
 scores_of_one = jax.jit(score_candidates)
 
@@ -95,26 +71,20 @@ def test_images_of_two_sizes_are_reported_on_as_one_by_one():
     for query in at.half.report:
         order = np.argsort(-(scores_of(HISTOGRAM, at, query) + c * at.candidates.scores[query]), kind="stable")
         expected.append([abs(at.candidates.indices[query][order[0]] - query) <= width for width in TOLERANCES])
-    compared = comparison._HalfComparison(at, Axes(HISTOGRAM, {}, {}), OPTIONS, None, Runtime())
+    compared = comparison.HalfComparison(at, Axes(HISTOGRAM, {}, {}), OPTIONS)
     np.testing.assert_array_equal(compared.evaluate("it", HISTOGRAM, {"c": c}).hits, np.transpose(expected))
 
 
 def test_images_of_two_sizes_are_learned_from_as_one_by_one():
     """The loss of a batch is that of its queries' scores, which are finite."""
     at = split()
-    model = start(at, HISTOGRAM, OPTIONS)
+    model = Model.of_ranking(at, HISTOGRAM, OPTIONS)
     batch = at.batch(at.train, len(at.train))
     loss = jax.jit(model.objective(LOSSES["cross_entropy"]))(model.start, batch)
     scores = np.stack([scores_of(model.scorer_of(model.start), at, query) for query in at.train])
     assert np.all(np.isfinite(scores))
     expected = mean_loss(cross_entropy, 2 * scores / model.unit, at.correct[at.train], at.usable[at.train])
     assert float(loss) == pytest.approx(float(expected), rel=1e-4)
-
-
-@pytest.mark.parametrize("value", [0.0, -1.0, np.nan, np.inf])
-def test_a_start_that_is_not_above_0_is_refused(value):
-    with pytest.raises(InputError, match=r"^sigma=.*: .*above 0"):
-        first_numbers(replace(HISTOGRAM, sigma=np.float32(value)), 1.0)
 
 
 def test_queries_without_a_wrong_candidate_teach_nothing_and_judge_nothing():
@@ -198,24 +168,9 @@ def test_it_finds_what_tells_right_matches_from_wrong_ones():
     loss = jax.jit(teachable.objective(None))
     assert loss(result.parameters, other) < 0.85 * loss(teachable.start, other)
     learned = teachable.scorer_of(result.parameters)
-    assert isinstance(learned, AggregatedScore)
     clear, doubtful = (
         jax.tree.map(lambda leaf: leaf[0, 0], replace(other.matches, ratio=np.full_like(other.matches.ratio, ratio)))
         for ratio in (0.4, 0.9)
     )
     weigh = jax.jit(LearnedWeight.__call__)
     assert np.all((weigh(learned.weight, clear) > 2 * weigh(learned.weight, doubtful))[:24])
-    assert teachable.values(result.parameters) == {}
-
-
-def test_the_teacher_goes_with_the_size_of_the_images_that_learning_sees():
-    taught_split = split()
-    matches = [*taught_split.match_set.matches]
-    for query in taught_split.half.report:
-        matches[query] = replace(matches[query], image_size0=np.float32([900, 900]))
-    taught_split = replace(taught_split, match_set=replace(taught_split.match_set, matches=matches))
-    taught_model = of_matches(taught_split, HistogramOfShifts(bin_size=20.0, sigma=20.0), Options(batch=4))
-    assert taught_model.teacher.sigma == pytest.approx(TEACHER_SIGMA * max(SIZES))
-    assert taught_model.teacher.bin_size == pytest.approx(taught_model.teacher.sigma / 2)
-    assert taught_model.teacher.max_bins >= 2 * max(SIZES) / taught_model.teacher.bin_size
-    assert taught_model.start["weight"].names == RELATIVE

@@ -1,5 +1,7 @@
 """Training: what it finds, when it ends, and that an interruption changes nothing."""
 
+from functools import partial
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -7,10 +9,44 @@ import optax
 import pytest
 
 from mfvpr import InputError
-from mfvpr.tuning.learning.training import TrainingError
-from tests.tuning.learning.toys import START, batches, contents, objective, same, train, validate
+from mfvpr.tuning.learning.training import Checkpoints, Schedule, TrainingError, fit
+from tests.storage.synthetic_features import DAMAGE
 
 pytestmark = pytest.mark.thorough
+
+RECIPE = {"model": {"scorer": "line", "sizes": (1, 3)}, "seed": None}
+START = {"slope": 1.0, "offset": np.array([0.5, -0.5, 0.0], np.float32)}
+
+
+def objective(parameters, batch):
+    x, y = batch
+    predicted = parameters["slope"] * x[:, None] + parameters["offset"][None]
+    return jnp.mean((predicted - y) ** 2)
+
+
+def batches(step):
+    """The line 3 x + (1, 2, 3), with noise."""
+    rng = np.random.default_rng(step)
+    x = rng.normal(size=8).astype(np.float32)
+    return x, (3 * x[:, None] + np.arange(1, 4) + rng.normal(size=(8, 3)) / 10).astype(np.float32)
+
+
+def validate(parameters):
+    return float(objective(parameters, batches(10**6)))
+
+
+def train(folder=None, steps=20, recipe=RECIPE, **changes):
+    schedule = {name: changes.pop(name) for name in ("optimizer", "every", "patience") if name in changes}
+    schedule = Schedule(**{"optimizer": optax.adam(0.1), "steps": steps, "every": 5} | schedule)
+    arguments = {"objective": objective, "batches": batches, "validate": validate, **changes}
+    return fit(START, schedule=schedule, checkpoints=folder and Checkpoints(folder, recipe), **arguments)
+
+
+def same(first, second):
+    """To the bit."""
+    leaves = zip(jax.tree.leaves(first.parameters), jax.tree.leaves(second.parameters), strict=True)
+    equal = all(np.asarray(a).tobytes() == np.asarray(b).tobytes() for a, b in leaves)
+    return equal and (first.step, first.history, first.ended) == (second.step, second.history, second.ended)
 
 
 @pytest.fixture(scope="module")
@@ -72,38 +108,38 @@ def test_one_compilation_for_all_steps(compilations):
     assert compiled[1] == compiled[-1]
 
 
-def test_goes_on_to_the_bit(tmp_path, uninterrupted):
-    half = train(tmp_path, steps=10)
-    assert half.history == uninterrupted.history[:3]
-    assert same(train(tmp_path), uninterrupted)
-    assert sorted({path.name for path in tmp_path.iterdir()} - {".lock"}) == ["15", "20"]
-    before = contents(tmp_path)
-    assert same(train(tmp_path, batches=None), uninterrupted)  # nothing is left to do
-    assert contents(tmp_path) == before
+def steps_of(training):
+    """Steps that a training does, in order."""
+    seen = []
+    result = training(batches=lambda step: seen.append(step) or batches(step))
+    return result, seen
 
 
 @pytest.mark.parametrize("validated", [True, False])
-def test_more_steps_than_were_asked_for_first_change_nothing(tmp_path, validated):
+def test_goes_on_to_the_bit(tmp_path, validated):
     """Seven steps end between two validations, where one of 20 steps would neither look nor choose."""
     options = {} if validated else {"validate": None}
     short = train(tmp_path, steps=7, **options)
     assert [record.step for record in short.history] == [0, 5, 7]
-    before = contents(tmp_path)
-    assert same(train(tmp_path, steps=7, batches=None, **options), short)
-    assert contents(tmp_path) == before
     assert same(short, train(steps=7, **options))
-    assert same(train(tmp_path, steps=9, **options), train(steps=9, **options))
-    assert same(train(tmp_path, **options), train(**options))
+    for steps, expected in ((7, []), (9, [7, 8]), (20, [*range(9, 20)])):
+        result, seen = steps_of(partial(train, tmp_path, steps=steps, **options))
+        assert same(result, train(steps=steps, **options))
+        assert seen == expected
+    with pytest.raises(InputError, match=r"steps=5: the checkpoint in .* is of step 20"):
+        train(tmp_path, steps=5, **options)
 
 
-def test_a_second_training_in_one_folder_is_refused(tmp_path):
-    def second(step):
-        if step == 8:
-            with pytest.raises(InputError, match="another process"):
-                train(tmp_path)
-        return batches(step)
-
-    assert same(train(tmp_path, batches=second), train(tmp_path))
+@pytest.mark.parametrize("damage", ["flipped", "half", "empty"])
+def test_a_damaged_checkpoint_and_that_of_another_training_are_not_taken(tmp_path, damage, uninterrupted):
+    train(tmp_path, steps=10, recipe={**RECIPE, "seed": 1})
+    train(tmp_path, steps=10)
+    newest = max(tmp_path.rglob("*.npz"), key=lambda path: path.stat().st_mtime_ns)
+    assert len(list(tmp_path.rglob("*.npz"))) == 2
+    DAMAGE[damage](newest)
+    result, seen = steps_of(partial(train, tmp_path))
+    assert same(result, uninterrupted)
+    assert seen == list(range(20))
 
 
 @pytest.mark.parametrize(("spike", "broken"), [
@@ -117,8 +153,9 @@ def test_what_is_not_finite_is_told_and_leaves_the_checkpoint(tmp_path, uninterr
 
     with pytest.raises(TrainingError, match=r"^step 13: .* of batch 13 is not finite; [^\n]*$"):
         train(tmp_path, batches=spiked, objective=broken)
-    assert {path.name for path in tmp_path.iterdir()} - {".lock"} == {"5", "10"}
-    assert same(train(tmp_path), uninterrupted)
+    result, seen = steps_of(partial(train, tmp_path))
+    assert same(result, uninterrupted)
+    assert seen == list(range(10, 20))
 
 
 def test_a_step_to_infinity_and_a_validation_of_nan_are_told():

@@ -63,11 +63,11 @@ def test_own_values_follow_from_the_scorer_unless_they_are_given():
     axes = Axes(mfvpr.HistogramOfShifts(), {"sigma": np.array([5, 10]), "truncate": [None], "weight": ["ratio"]})
     assert axes.values["sigma"] == [5, 10]
     assert type(axes.values["sigma"][0]) is int
-    assert axes.own == {"sigma": 22.5, "truncate": None, "weight": "fs"}
+    assert axes.own_values == {"sigma": 22.5, "truncate": None, "weight": "fs"}
     learned = mfvpr.AggregatedScore(weight=named_weight("learned_aliked"))
-    assert Axes(learned, {"weight": ["fs"]}).own == {"weight": "learned_aliked"}
+    assert Axes(learned, {"weight": ["fs"]}).own_values == {"weight": "learned_aliked"}
     wrapped = Axes(Wrapped(), {"inner.sigma": [9.0], "c": ["auto"], "max_distance": [0.5]}, {"c": 2, "sigma": 1})
-    assert wrapped.own == {"inner.sigma": 18.0, "c": 2, "max_distance": None}
+    assert wrapped.own_values == {"inner.sigma": 18.0, "c": 2, "max_distance": None}
 
 
 @pytest.mark.parametrize(("values", "words"), [
@@ -139,7 +139,7 @@ def test_optuna_proposes_after_the_own_values_and_learns_from_the_queries_that_c
     axes = Axes(SUM, {"weight": ["fs", "unit"], "c": [0.5, 3.0]}, {"weight": "dmf", "c": 2})
     protocol = evaluation_protocol(TRUTH, TOLERANCES, "both")
     outcome = sweeping.search_optuna(axes, protocol, *data, sweeping.SweepOptions(ks=[1]), trials=3, seed=1)
-    assert outcome.settings[0] == axes.own
+    assert outcome.settings[0] == axes.own_values
     assert outcome.rows.shape == (3, 4, QUERIES, 1)
     trials = outcome.protocol.tuning(outcome.rows)[:, 1:, 1]  # the own values are no choice
     assert outcome.chosen == (1 + np.argmax(trials, axis=1)).tolist()
