@@ -173,7 +173,7 @@ def test_wrong_settings(options, message):
 
 def test_where_a_matcher_must_be_compiled_it_is_refused(dataset, tmp_path):
     system = mfvpr.System(pipeline(mfvpr.HostMatcher(Counting(), "square")), SCORERS)
-    with one_line_error("HostMatcher", "map"):
+    with one_line_error("a map needs a matcher that JAX can compile"):
         mfvpr.Map.create(tmp_path / "map", dataset.database.root, system)
 
 
