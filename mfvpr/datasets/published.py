@@ -289,6 +289,8 @@ def read_rows(path: Path, num_database: int) -> list[tuple[int, ...]]:
         if rows.size and not (rows.dtype.kind in "iu" and 0 <= rows.min() <= rows.max() < num_database):
             expected = f"rows from 0 to {num_database - 1}"
             raise InputError(f"{path}: query {query}: expected {expected}, got {rows.dtype} {shorten(str(rows))}")
+        if len({*rows.tolist()}) < rows.size:  # such as flags, of which most are equal
+            raise InputError(f"{path}: query {query}: expected every row once, got {shorten(str(rows))}")
     return [tuple(rows.tolist()) for rows in per_query]
 
 

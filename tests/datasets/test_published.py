@@ -247,6 +247,7 @@ class Hostile:
         (objects(np.array([-1]), np.array([0])), "expected rows from 0 to 2, got int64 [-1]"),
         (objects(np.array([0])), "expected rows of 2 queries, got 1"),
         (objects(np.array([0.5]), np.array([0])), "expected rows from 0 to 2, got float64"),
+        (np.eye(2, 3, dtype=int), "query 0: expected every row once"),
         (objects(Hostile(), np.array([0])), "nothing was executed"),
     ],
 )

@@ -1,10 +1,14 @@
 """Gradient descent on a pytree of arrays, with validation, early stopping, and resuming to the bit."""
 
 import json
+import logging
 import math
-from collections.abc import Callable, Mapping
+import shutil
+import warnings
+import zlib
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
-from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -12,13 +16,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import optax
+import orbax.checkpoint as ocp
 
 from mfvpr.core.types import Array
-from mfvpr.storage.cache_files import CacheFiles
+from mfvpr.storage.cache_files import disk_errors_as_input_errors
 from mfvpr.utils.errors import InputError
+from mfvpr.utils.fingerprints import fingerprint
 from mfvpr.utils.runtime import Track, no_progress
-
-_KEY = "00last"  # of the checkpoint in its folder
 
 
 class TrainingError(InputError):
@@ -112,7 +116,7 @@ def fit(
         track: progress over the steps.
 
     Raises:
-        InputError: the folder cannot be used, or has a checkpoint of more steps.
+        InputError: the folder cannot be used, or has a checkpoint of more steps of this training.
         TrainingError: loss, gradient, parameters or validation are not finite. The last checkpoint stays.
     """
     every, steps, patience = schedule.every, schedule.steps, schedule.patience
@@ -136,13 +140,10 @@ def fit(
 
     parameters = _strong(parameters)
     state = State(parameters, parameters, _strong(schedule.optimizer.init(parameters)))
-    files = None
-    if checkpoints:
-        unpack = partial(_unpack, jax.tree.structure(state.arrays))
-        files = CacheFiles(checkpoints.folder, checkpoints.name, checkpoints.recipe, _pack, unpack)
-    state = (None if files is None else files.get(_KEY)) or add_record(state)
+    folder = checkpoints and checkpoints.folder / f"{checkpoints.name}-{fingerprint(checkpoints.recipe)}"
+    state = (folder and restore(folder, jax.tree.structure(state.arrays))) or add_record(state)
     if state.step > steps:
-        got = f"the checkpoint in {checkpoints and checkpoints.folder} is of step {state.step}"
+        got = f"the checkpoint in {folder} is of step {state.step}"
         raise InputError(f"steps={steps}: {got}; ask for more steps, or choose another folder")
     remaining = 0 if state.is_out_of(patience) else steps - state.step
     for step in track(range(state.step, state.step + remaining), remaining):
@@ -152,8 +153,8 @@ def fit(
         state = replace(state, parameters=learned, optimizer=memory, losses=(*state.losses, float(loss)))
         if is_due := state.step % every == 0:
             state = add_record(state)
-        if files is not None and (is_due or state.step == steps):
-            files.update({_KEY: state})
+        if folder and (is_due or state.step == steps):
+            save_checkpoint(folder, state)
         if state.is_out_of(patience):
             break
     if state.losses:  # after the checkpoint: a training of more steps would not validate here
@@ -171,14 +172,55 @@ def _strong(tree: Any) -> Any:
     return jax.tree.map(lambda leaf: jnp.asarray(leaf, dtype=jnp.result_type(leaf)), tree)
 
 
-def _pack(state: State) -> dict[str, np.ndarray]:
-    record = json.dumps([state.history, state.losses]).encode()
-    leaves = {str(place): np.asarray(leaf) for place, leaf in enumerate(jax.tree.leaves(state.arrays))}
-    return leaves | {"record": np.frombuffer(record, np.uint8)}
+def save_checkpoint(folder: Path, state: State) -> None:
+    """Write a state, and remove the one before it."""
+    leaves = [np.asarray(leaf) for leaf in jax.tree.leaves(state.arrays)]
+    record = json.dumps([state.history, state.losses, _checksum(leaves)]).encode()
+    arrays = {str(place): leaf for place, leaf in enumerate(leaves)} | {"record": np.frombuffer(record, np.uint8)}
+    with disk_errors_as_input_errors(folder), _manager(folder) as manager:
+        manager.save(state.step, args=ocp.args.StandardSave(arrays))
 
 
-def _unpack(structure: Any, arrays: Mapping[str, np.ndarray]) -> State:
-    history, losses = json.loads(arrays["record"].tobytes())
-    leaves = [arrays[str(place)] for place in range(len(arrays) - 1)]
-    parameters, best, optimizer = _strong(jax.tree.unflatten(structure, leaves))
+def restore(folder: Path, structure: Any) -> State | None:
+    """The last state, whose arrays have this structure; None without one. A damaged one is removed, with a warning."""
+    if not folder.exists():
+        return None
+    try:
+        with _manager(folder) as manager:
+            if (step := manager.latest_step()) is None:
+                return None
+            arrays = dict(manager.restore(step, args=ocp.args.StandardRestore()))
+        history, losses, checksum = json.loads(arrays.pop("record").tobytes())
+        leaves = [arrays[str(place)] for place in range(len(arrays))]
+        if _checksum(leaves) != checksum:
+            raise ValueError("another checksum")
+        parameters, best, optimizer = _strong(jax.tree.unflatten(structure, leaves))
+    except Exception as error:  # of any kind from Orbax and TensorStore
+        reason = " ".join(str(error).partition("[")[0].split())[:200]
+        warnings.warn(f"{folder}: the checkpoint is damaged ({reason}); the training starts again", stacklevel=3)
+        shutil.rmtree(folder)
+        return None
     return State(parameters, best, optimizer, tuple(Record(*row) for row in history), tuple(losses))
+
+
+@contextmanager
+def _manager(folder: Path) -> Iterator[ocp.CheckpointManager]:
+    """Orbax's manager, without its logs and warnings."""
+    logger = logging.getLogger("absl")
+    level = logger.level
+    logger.setLevel(logging.CRITICAL)
+    options = ocp.CheckpointManagerOptions(
+        max_to_keep=1,
+        enable_async_checkpointing=False,  # `save` returns when the checkpoint is on disk
+        cleanup_tmp_directories=True,  # of killed processes
+        save_root_metadata=False,
+    )
+    try:
+        with warnings.catch_warnings(action="ignore"), ocp.CheckpointManager(folder.absolute(), options=options) as it:
+            yield it
+    finally:
+        logger.setLevel(level)
+
+
+def _checksum(leaves: list[np.ndarray]) -> int:
+    return zlib.crc32(b"".join(leaf.tobytes() for leaf in leaves))
