@@ -161,5 +161,5 @@ def test_features_of_another_kind_are_one_line():
         match_one(matcher(), *pair(COUNTS, 8, 0))
     with pytest.raises(InputError, match=r"^depth_confidence=95: .*0 to 1, or null$"):
         Pipeline(Extractor(16), retriever, matcher(depth_confidence=95))
-    with pytest.raises(InputError, match=r"^matcher: .*the class NearestNeighborMatcher; .*mfvpr.Matcher"):
+    with pytest.raises(InputError, match=r"^matcher: .*got <class .*NearestNeighborMatcher.*mfvpr.Matcher"):
         Pipeline(Extractor(16), retriever, NearestNeighborMatcher)

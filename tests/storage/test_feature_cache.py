@@ -181,7 +181,7 @@ def test_bad_images_are_tried_again_by_the_next_run(tmp_path):
 
 def test_bad_images_fail_by_default_with_the_mend(tmp_path):
     (tmp_path / "a.png").write_bytes(b"")
-    with pytest.raises(InputError, match=r"a\.png.*0 bytes.*, or set on_bad_image=skip"):
+    with pytest.raises(InputError, match=r"a\.png: cannot be read .*, or set on_bad_image=skip"):
         FeatureCache().local(image_folder(tmp_path), SIFT)
     with pytest.raises(InputError, match=r"none of 1 images .*a\.png"):
         FeatureCache(skip_bad=True).local(image_folder(tmp_path), SIFT)
