@@ -5,6 +5,7 @@ The file of a learned weight is JSON with its provenance.
 
 import json
 import math
+import os
 from collections.abc import Callable, Mapping
 from dataclasses import field, fields
 from functools import cache, partial
@@ -171,6 +172,8 @@ def read_weight(path: Path | str) -> tuple[LearnedWeight, dict[str, Any]]:
         shapes = [(inputs,), (inputs,), (inputs, hidden), (hidden,), (hidden,), ()]
         if content["format"] != _FORMAT or not {*names} <= {*INPUTS} or [a.shape for a in arrays.values()] != shapes:
             raise ValueError("another format")
+        if not all(jnp.isfinite(each).all() for each in arrays.values()) or not (arrays["scale"] > 0).all():
+            raise ValueError("numbers that make no weight")
         return LearnedWeight(**arrays, names=names), dict(content["made"])
     except (OSError, ValueError, LookupError, TypeError) as error:
         raise InputError(f"{path}: expected a match weight that mfvpr learn wrote ({error})") from error
@@ -189,7 +192,7 @@ def provenance(name: str) -> dict[str, Any]:
 
 
 def _read_by_name(name: str) -> tuple[Weight, dict[str, Any]]:
-    path = _LEARNED.get(name, Path(name).expanduser())
+    path = _LEARNED.get(name, Path(os.path.expanduser(name)))
     if path.suffix != SUFFIX:
         raise InputError(f"weight={name!r}: expected one of {', '.join(WORDS)}, or FILE{SUFFIX}")
     return _read(path, path.stat().st_mtime_ns if path.exists() else 0)

@@ -59,7 +59,7 @@ def explain(error: Exception) -> str | None:
     if not is_group and not isinstance(error, HydraException | OmegaConfBaseException):
         return None
     text = " ".join((str(error) or str(error.__cause__)).split())
-    for rest in (" Config search path", " See https", " To append to your config", " object_type="):
+    for rest in (" Config search path", " See https", " To append to your ", " object_type="):
         text = text.partition(rest)[0]
     new_names = [f"; its name is {new} now" for old, new in _OTHER_NAMES.items() if f"'{old}'" in text]
     return text + "".join(new_names)

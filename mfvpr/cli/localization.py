@@ -86,6 +86,8 @@ def localize(settings: Localize) -> None:
                 print(printable(json.dumps({"image": name} | line, ensure_ascii=False, allow_nan=False)), flush=True)
     if drive.failed:
         raise InputError(f"{drive.failed} of the images could not be localized; their lines say why")
+    if drive.undrawn:
+        raise InputError(f"{drive.undrawn} of the figures could not be drawn; warnings say why")
     if drive.missing:
         names = ",".join(sorted(map(str, drive.missing)))
         raise InputError(f"figures=[{names}]: expected rows of localized images, from 0, or names as in the lines")
@@ -101,7 +103,7 @@ class _Drive:
         self._route = None if settings.route is None else Route(Drive(advance), warn=tell_route)
         self._wanted = set(range(figures) if isinstance(figures, int) else figures)
         self.missing = set() if isinstance(figures, int) else {*self._wanted}  # figures whose image did not come
-        self.failed = 0
+        self.failed = self.undrawn = 0
         self._root = None if settings.root is None else expand_user(settings.root)
         if self._root and not self._root.is_dir():
             raise InputError(f"root={self._root}: expected the folder of the map's images, got no folder")
@@ -136,8 +138,13 @@ class _Drive:
             self.missing -= names
             [file] = file_names([f"{number:04d}_{PurePath(name).stem}"]).values()
             path = expand_user(settings.out) / f"{file}.png"
-            localization_figure(path, known, name, pixels, localized, root=self._root)
-            line["figure"] = str(path)
+            try:
+                localization_figure(path, known, name, pixels, localized, root=self._root)
+                line["figure"] = str(path)
+            except Exception as error:  # of any kind from Matplotlib; the drive goes on
+                line["figure"] = None
+                self.undrawn += 1
+                warn(f"{path}: not drawn ({error})")
 
     def _route_entry(self, located: Located | None) -> dict[str, Any]:
         if self._route is None or located is None:

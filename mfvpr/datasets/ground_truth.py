@@ -210,6 +210,7 @@ class AllowedTruth(Truth):
 
 def require_positions(where: str, xy: np.ndarray, count: int) -> None:
     """Raise an InputError unless there is a position in meters for each of `count` images."""
+    xy = np.asarray(xy, np.float64)
     if xy.shape != (count, 2) or not (np.abs(xy) <= FARTHEST).all():  # NaN neither
         got = f"{[*xy.shape]} up to {np.abs(xy).max(initial=0):g} m"
         raise InputError(f"{where}: expected positions [{count}, 2] of all images, at most {FARTHEST:g} m, got {got}")

@@ -29,7 +29,10 @@ class Positives:
     matrix: "scipy.sparse.csr_array"
 
     def __post_init__(self) -> None:
-        self.matrix.sum_duplicates()  # and sort each query's rows
+        matrix = scipy.sparse.csr_array(self.matrix, dtype=bool, copy=True)
+        matrix.sum_duplicates()  # and sort each query's rows
+        matrix.eliminate_zeros()
+        object.__setattr__(self, "matrix", matrix)
 
     @classmethod
     def from_rows(cls, rows: Iterable[Sequence[int] | np.ndarray], num_database: int) -> "Positives":

@@ -164,7 +164,10 @@ def robotcar_seasons(root: Path) -> Dataset:
         if not np.allclose(poses[:, 3], (0, 0, 0, 1), rtol=0, atol=1e-6) or not (np.abs(poses) <= FARTHEST).all():
             raise ValueError("numbers that are no pose")
     images = (PurePosixPath(words[0]).with_suffix(".jpg").as_posix() for words in lines)
-    centers = dict(zip(images, poses[:, :3, 3], strict=True))
+    centers: dict[str, np.ndarray] = {}
+    for image, center in zip(images, poses[:, :3, 3], strict=True):
+        if not np.array_equal(centers.setdefault(image, center), center):
+            raise InputError(f"{path}: expected one pose of {image}, got another; get the file again")
     sides = {
         condition: sorted(image for image in centers if image.startswith(f"{condition}/rear/"))
         for condition in (REFERENCE, *CONDITIONS)
@@ -223,7 +226,10 @@ def msls_val(root: Path) -> Content:
         for table in ("postprocessed", "raw", "subtask_index"):
             path = folder / f"{table}.csv"
             with reading(path, "a table"), path.open(newline="", encoding="utf-8") as file:
-                tables.append({line["key"]: line for line in csv.DictReader(file)})
+                lines = list(csv.DictReader(file))
+                tables.append({line["key"]: line for line in lines})
+                if len(tables[-1]) < len(lines) or tables[-1].keys() != tables[0].keys():
+                    raise ValueError("expected equal keys in all tables, each once")
         mend = "expected equal keys in all three tables, and pano, all (True or False), easting, northing"
         with reading(folder / "postprocessed.csv", mend=mend):
             processed, raw, tasks = tables

@@ -93,6 +93,7 @@ def fit_confidence(
         values: of `confidence_inputs` with this `apart`; rows that are not finite are left out.
         correct: whether the top prediction is correct; False for queries without a place in the database.
     """
+    values, correct = np.asarray(values), np.asarray(correct, bool)
     there = np.isfinite(values).all(axis=1)
     values, correct = values[there], correct[there]
     if not len(values):
@@ -187,9 +188,14 @@ def read_confidences(path: Path | str) -> tuple[dict[str, Confidence], dict[str,
 
 
 def confidence_from_json(values: Mapping[str, Any]) -> Confidence:
-    """The confidence whose `vars` were written as JSON; a TypeError for other fields."""
-    fields: Any = {name: tuple(value) if isinstance(value, list) else value for name, value in values.items()}
-    return Confidence(**fields)
+    """The confidence whose `vars` were written as JSON; a TypeError or ValueError for values that make no model."""
+    vectors = {name: tuple(values[name]) for name in ("center", "scale", "weights", "refusals")}
+    numbers = np.array([*vectors.values()], float)  # [4, 2]: two inputs, two shares
+    _, scale, weights, shares = numbers
+    is_fitted = numbers.shape == (4, 2) and np.isfinite(numbers).all() and np.isfinite(values["bias"])
+    if not (is_fitted and min(*scale, *shares) > 0 and min(weights) >= 0 and max(shares) <= 1):
+        raise ValueError("values that make no model")
+    return Confidence(**{**values, **vectors})
 
 
 class PrecisionRecall(NamedTuple):
@@ -237,7 +243,8 @@ def precision_recall(
         has_positives: queries with positives in the database; None = all. A prediction for another query is incorrect
             and lowers the precision. An InputError if it is called correct.
     """
-    if has_positives is not None and np.any(correct & ~has_positives):
+    confidence, correct = np.asarray(confidence, float), np.asarray(correct, bool)
+    if has_positives is not None and np.any(correct & ~np.asarray(has_positives, bool)):
         raise InputError("correct: expected no correct predictions for queries without positives")
     num_positive = len(correct) if has_positives is None else np.sum(has_positives)
     order = np.argsort(-confidence, kind="stable")[: np.sum(~np.isnan(confidence))]
@@ -249,6 +256,7 @@ def precision_recall(
 
 def reliability(probability: Float[np.ndarray, " queries"], correct: Bool[np.ndarray, " queries"]) -> Reliability:
     """Compare probabilities with the fractions of correct predictions, in 10 bins; NaN probabilities are left out."""
+    probability, correct = np.asarray(probability, float), np.asarray(correct, bool)
     there = ~np.isnan(probability)
     probability, correct = probability[there], correct[there]
     place = _bin_numbers(probability)

@@ -263,7 +263,8 @@ def _read_matches(
         return None
     try:
         remarks = json.loads((stores[0].folder / _REMARKS).read_text())
-    except (OSError, ValueError):
+        remarks = {name: remarks[name] for name in ("warnings", "queries", "database")}
+    except (OSError, ValueError, LookupError, TypeError):
         return None  # so images are read again, but not matched
     cache.runtime.log(f"{sequence.name} matches: all {len(sequence.images)} queries from {stores[0].folder}")
     with watch("matches read"):

@@ -127,7 +127,8 @@ def write_trajectory(path: Path | str, poses: Sequence[str | None], stamps: Sequ
         raise InputError(f"{path}: expected {expected}, got {len(places)} places of {len(poses)} images")
     num_numbers = _KITTI if stamps is None else _TUM
     if any(len(pose.split()) != num_numbers for pose in places):
-        raise InputError(f"{path}: expected poses of {num_numbers} numbers; TUM needs times, KITTI has none")
+        expected = f"a pose of {num_numbers} numbers in each line of the poses"
+        raise InputError(f"{path}: expected {expected}, got {len(places[0].split())}; TUM's have a time, KITTI's none")
     if stamps is not None and len({*stamps}) < len(stamps):
         raise InputError(f"{path}: expected different times, got one twice")
     if stamps is None:

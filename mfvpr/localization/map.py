@@ -168,7 +168,8 @@ class Map(MapImages):
             warnings.warn("a part of the system names no `recipe`: the confidence is not kept on disk", stacklevel=2)
         else:
             content = {"system": of_system, "queries": len(data.correct), "absent_queries": data.num_absent}
-            self._write({"confidence": json.dumps(content | {"confidence": vars(self.confidence)}).encode()})
+            with self._file.lock():
+                self._write({"confidence": json.dumps(content | {"confidence": vars(self.confidence)}).encode()})
         return self.confidence
 
     def localize(self, image: Image, *, recent: int = 0, route: Route | None = None) -> Prediction:

@@ -394,7 +394,8 @@ class MapImages:
         self._write({}, [*zip(features, entries, strict=True)])
 
     def _write(self, parts: dict[str, bytes], images: Sequence[tuple[Features, Entry]] = ()) -> None:
-        """Write parts and images, and settings first if the map is new."""
+        """Write parts and images, and settings first if the map is new; the lock is held."""
+        self.refresh()  # another process may have made the map meanwhile, with other settings
         new = {} if self._is_checked else {name: json.dumps(part).encode() for name, part in self._parts.items()}
         self._file.write(new | parts, images)
         self.refresh()

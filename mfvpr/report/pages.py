@@ -318,7 +318,7 @@ def _settings_section(run: Run) -> Section:
     about |= {name.replace("_", " "): common[name] for name in ("ground_truth", "data_fingerprint")}
     seconds = [[stage, f"{value:.3f}", f"{value / queries:.4f}"] for stage, value in common["seconds"].items()]
     tables = {
-        "Seconds, without what the stores had already": Table(["stage", "seconds", "per query"], seconds),
+        "Seconds, without what the cache had already": Table(["stage", "seconds", "per query"], seconds),
         "Run": values_table(about),
         "Settings": values_table(run.about["settings"]),
         "Versions": values_table(common["versions"]),

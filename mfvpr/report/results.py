@@ -20,7 +20,7 @@ from mfvpr.report.pages import write_report as write_page
 from mfvpr.report.prediction_files import CandidateLayout, write_candidates
 from mfvpr.report.run_files import save_run
 from mfvpr.report.runs import claim_run_folder, file_names, write_table
-from mfvpr.report.tables import Table
+from mfvpr.report.tables import Table, data_frame
 from mfvpr.storage.feature_cache import FeatureCache
 from mfvpr.utils.errors import InputError
 from mfvpr.utils.runtime import Runtime
@@ -72,6 +72,8 @@ def evaluate(
         raise InputError(f"cache: expected mfvpr.storage.FeatureCache(folder), got {type(cache).__name__}")
     datasets = data if isinstance(data, Mapping) else {data.name: data}
     systems = system if isinstance(system, Mapping) else {system.headline: system}
+    if not datasets or not systems:
+        raise InputError("evaluate: expected at least one data set and one system, got none")
     pairs = [(dataset_name, system_name) for dataset_name in datasets for system_name in systems]
     ranked = [rank_dataset(datasets[a], systems[b], cache=cache, runtime=runtime) for a, b in pairs]
     return Result(dict(zip(pairs, ranked, strict=True)), cache)
@@ -124,13 +126,11 @@ class Result:
 
     def to_pandas(self, thresholds: Thresholds = None, ks: Sequence[int] = KS) -> "DataFrame":
         """Recall from 0 to 1: a row for each data set, system, final score, sequence and threshold; needs pandas."""
-        from pandas import DataFrame
-
         rows = []
         for row in self._rows(thresholds, ks):
             recall_at = row.pop("recall_at")
             rows.append(row | {f"R@{k}": recall for k, recall in recall_at.items()})
-        return DataFrame(rows)
+        return data_frame(rows)
 
     @cached_property
     def predictions(self) -> list[TopPrediction]:

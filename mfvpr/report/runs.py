@@ -133,12 +133,17 @@ def add_job(multirun: Path, number: int, overrides: Mapping[str, str], run: Path
         known = json.loads((multirun / LAST).read_text("utf-8"))["jobs"] if (multirun / LAST).exists() else []
         jobs = sorted([*known, job], key=lambda job: job["job"])
         names = dict.fromkeys(name for job in jobs for name in job["overrides"] if name != "out")
-        differing = [name for name in names if len({job["overrides"].get(name) for job in jobs}) > 1]
+        columns = {name for job in jobs for row in job["rows"] for name in row}
+        differing = {
+            name: f"{name}=" if name in columns else name  # such as system, which is also a column of results
+            for name in names
+            if len({job["overrides"].get(name) for job in jobs}) > 1
+        }
         lines = []
         for each in jobs:
-            settings = {name: each["overrides"].get(name, "") for name in differing}
+            settings = {column: each["overrides"].get(name, "") for name, column in differing.items()}
             lines += [{"job": str(each["job"])} | settings | row | {"run": each["run"]} for row in each["rows"]]
-        table = table_of(lines, ["job", *differing, "system", "sequence"])
+        table = table_of(lines, ["job", *differing.values(), "system", "sequence"])
         write_table(multirun, table, f"{len(jobs)} jobs")
         write_json(multirun / LAST, {"jobs": jobs})
 

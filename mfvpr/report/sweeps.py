@@ -17,7 +17,7 @@ from mfvpr.evaluation.statistics import Estimate
 from mfvpr.report import runs
 from mfvpr.report.plots import MARK, panels, save_figure
 from mfvpr.report.runs import Figure, file_names
-from mfvpr.report.tables import Table, format_estimate, format_value, format_values
+from mfvpr.report.tables import Table, data_frame, format_estimate, format_value, format_values
 from mfvpr.tuning.sweeps.setting_search import Axes, Outcome
 from mfvpr.utils.errors import InputError
 from mfvpr.utils.files import write_text
@@ -76,10 +76,9 @@ class Sweep:
 
     def to_pandas(self) -> "DataFrame":
         """A row per setting: its values, and recall as fractions; needs pandas."""
-        from pandas import DataFrame
-
         header, recalls = _recalls(self.outcome, range(len(self.outcome.settings)))
-        return DataFrame(list(self.outcome.settings)).join(DataFrame(recalls, columns=header))
+        rows = zip(self.outcome.settings, recalls.tolist(), strict=True)
+        return data_frame([{**setting, **dict(zip(header, recall, strict=True))} for setting, recall in rows])
 
     def plot(self, *names: str) -> Canvas:
         """A heat map of recall@1 over one or two axes, the other axes at the best setting: `plot("sigma", "weight")`.

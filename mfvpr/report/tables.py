@@ -5,11 +5,15 @@ import io
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from mfvpr.utils.errors import InputError
 from mfvpr.utils.files import replacing
+
+if TYPE_CHECKING:
+    from pandas import DataFrame
 
 _LATEX = str.maketrans(
     {character: rf"\{character}" for character in "&%_#${}"}
@@ -53,6 +57,15 @@ class Table:
         columns = "l" * self.text_columns + "r" * (len(self.header) - self.text_columns)
         body = [rf"\begin{{tabular}}{{{columns}}}", r"\toprule", lines[0], r"\midrule", *lines[1:], r"\bottomrule"]
         return "\n".join([*body, r"\end{tabular}", ""])
+
+
+def data_frame(rows: Sequence[Mapping[str, Any]]) -> "DataFrame":
+    """Rows by column as a `DataFrame`; InputError if pandas is not installed."""
+    try:
+        import pandas
+    except ImportError:
+        raise InputError("to_pandas: expected pandas, got none; run pip install 'mfvpr[pandas]'") from None
+    return pandas.DataFrame(rows)
 
 
 def table_of(rows: Sequence[Mapping[str, str]], text_columns: Sequence[str]) -> Table:

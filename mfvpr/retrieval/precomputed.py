@@ -108,6 +108,12 @@ class ShortlistFiles:
         file, queries, known = _file_of(self.files, sequence.images), sequence.images, ImageOfEntry()
         names = [self.database_prefix + name for name in database.names]
         shortlist, query_entries, entries = read_shortlist(file.path, file.names(queries), names)
+        here, elsewhere = (f"/{each.root.absolute().as_posix().strip('/')}/" for each in (database, queries))
+        for name, entry in zip(database.names, entries, strict=True):
+            start = "/" if entry is None else "/" + entry.name.removesuffix(name).lstrip("/")
+            if start != "/" and elsewhere.endswith(start) and not here.endswith(start):
+                got = f"those in {queries.root}; exchange dataset.database and dataset.queries, or the file's columns"
+                raise InputError(f"{file.path}: expected names of images in {database.root}, got {got}")
         require_one_image(file.path, database.paths, entries, known)
         require_one_image(file.path, queries.paths, query_entries, known)
         if sequence.excluded is not None:

@@ -326,6 +326,7 @@ def test_faults_of_msls(msls):
     check_error("msls_val", msls / "train_val", "postprocessed.csv: expected a table")
     for table, before, after, words in (
         ("subtask_index", "q3", "q4", "expected equal keys"),
+        ("postprocessed", "q3", "q2", "expected equal keys"),
         ("postprocessed", "easting", "east", "and pano, all (True"),
         ("postprocessed", "5000000.0", "nan", "expected positions"),
     ):

@@ -81,8 +81,8 @@ def test_poses_belong_to_the_times_of_the_images(write):
         ([KITTI[0], None], None, "a place of all images, .* got 1 places of 2 images"),
         ([None, None], [1, 2], "for TUM of at least one, got 0 places of 2 images"),
         (["1 2 3 0 0 0 1"] * 2, [5, 5], "expected different times"),
-        (["1 2 3 0 0 0 1"] * 2, None, "expected poses of 12 numbers"),
-        (KITTI[:2], [1, 2], "expected poses of 7 numbers"),
+        (["1 2 3 0 0 0 1"] * 2, None, "expected a pose of 12 numbers"),
+        (KITTI[:2], [1, 2], "expected a pose of 7 numbers"),
     ],
 )
 def test_trajectories_that_cannot_be_written(tmp_path, poses, stamps, message):

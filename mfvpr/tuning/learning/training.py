@@ -19,7 +19,6 @@ import optax
 import orbax.checkpoint as ocp
 
 from mfvpr.core.types import Array
-from mfvpr.storage.cache_files import disk_errors_as_input_errors
 from mfvpr.utils.errors import InputError
 from mfvpr.utils.fingerprints import fingerprint
 from mfvpr.utils.runtime import Track, no_progress
@@ -177,8 +176,12 @@ def save_checkpoint(folder: Path, state: State) -> None:
     leaves = [np.asarray(leaf) for leaf in jax.tree.leaves(state.arrays)]
     record = json.dumps([state.history, state.losses, _checksum(leaves)]).encode()
     arrays = {str(place): leaf for place, leaf in enumerate(leaves)} | {"record": np.frombuffer(record, np.uint8)}
-    with disk_errors_as_input_errors(folder), _manager(folder) as manager:
-        manager.save(state.step, args=ocp.args.StandardSave(arrays))
+    try:
+        with _manager(folder) as manager:
+            manager.save(state.step, args=ocp.args.StandardSave(arrays))
+    except (OSError, ValueError, RuntimeError) as error:  # TensorStore's, such as of a full disk
+        words = f"the checkpoint of step {state.step} cannot be written ({_reason(error)}); check the path and its disk"
+        raise InputError(f"{folder}: {words}") from None
 
 
 def restore(folder: Path, structure: Any) -> State | None:
@@ -195,9 +198,12 @@ def restore(folder: Path, structure: Any) -> State | None:
         if _checksum(leaves) != checksum:
             raise ValueError("another checksum")
         parameters, best, optimizer = _strong(jax.tree.unflatten(structure, leaves))
+    except PermissionError as error:
+        raise InputError(f"{folder}: the checkpoint cannot be read ({_reason(error)}); check its permissions") from None
     except Exception as error:  # of any kind from Orbax and TensorStore
-        reason = " ".join(str(error).partition("[")[0].split())[:200]
-        warnings.warn(f"{folder}: the checkpoint is damaged ({reason}); the training starts again", stacklevel=3)
+        warnings.warn(
+            f"{folder}: the checkpoint is damaged ({_reason(error)}); the training starts again", stacklevel=3
+        )
         shutil.rmtree(folder)
         return None
     return State(parameters, best, optimizer, tuple(Record(*row) for row in history), tuple(losses))
@@ -220,6 +226,10 @@ def _manager(folder: Path) -> Iterator[ocp.CheckpointManager]:
             yield it
     finally:
         logger.setLevel(level)
+
+
+def _reason(error: Exception) -> str:
+    return " ".join(str(error).partition("[")[0].split())[:200]
 
 
 def _checksum(leaves: list[np.ndarray]) -> int:
