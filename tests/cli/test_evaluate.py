@@ -76,7 +76,7 @@ def test_bad_images_by_policy(small_street, tmp_path, succeed, refuse):
                  override("dataset.queries", root / "queries"),
                  "dataset.ground_truth=order", *QUICK, "candidates=99", f"out={tmp_path}/out"]  # fmt: skip
 
-    assert "é 0003.png: expected an image file" in refuse("evaluate", *arguments)
+    assert "é 0003.png: cannot be read" in refuse("evaluate", *arguments)
     assert sorted(path.name for path in tmp_path.iterdir()) == ["a@b, c's"]
 
     _, stderr = succeed("evaluate", *arguments, "on_bad_image=skip")
@@ -149,7 +149,7 @@ def test_demo_prints_its_table_and_leaves_a_run_folder(demo):
     assert (folder / "report.html").read_text("utf-8").count('src="data:image/jpeg;base64,') == 6
     assert "database features" in done.stderr
     figures = [*(folder / "figures").iterdir()]
-    assert {path.stem.split("_")[0] for path in figures} == {"correct", "incorrect", "reliability"}
+    assert {path.stem.split("_")[0] for path in figures} == {"correct", "incorrect"}
     for path in figures:
         image = np.asarray(Image.open(path).convert("L"))
         assert image.shape[0] > 300
