@@ -43,7 +43,7 @@ def draw(root: Path, seed: int, lane: float, shape: tuple[int, int]) -> Path:
         weathers = [weather for weather in ("night", "snow") for _ in range(FRAMES // 2)]
         drives = [Drive(street / "database", database, ["day"] * FRAMES, (seed, 7)),
                   Drive(street / "queries", queries, weathers, (seed, 8), street / TRUTH)]  # fmt: skip
-        draw_drives(drives, seed, SPACING * FRAMES, None)
+        draw_drives(drives, seed, SPACING * FRAMES)
     return street
 
 

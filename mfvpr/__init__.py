@@ -16,10 +16,10 @@ import lazy_loader
 
 __version__ = "0.2.0"
 
-_name, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)
+_public_name, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)
 
 
 def __getattr__(name: str) -> Any:
     """A public name, or a package such as `mfvpr.core`."""
     is_package = name not in __all__ and find_spec(f"{__name__}.{name}") is not None
-    return import_module(f"{__name__}.{name}") if is_package else _name(name)
+    return import_module(f"{__name__}.{name}") if is_package else _public_name(name)

@@ -19,7 +19,7 @@ BENCHMARKS = {
     "scores": "matching and scoring of one query with 50 candidates (15 rounds)",
     "search": "nearest global descriptors of 1, 20 and 100 queries among 10,000 and 100,000 (5 rounds; 6 GB)",
     "sweeps": "grids of a score's parameters on cached matches (7 rounds)",
-    "networks": "D2-Net, MixVPR, ALIKED; without torch, NetVLAD, Patch-NetVLAD, SelaVPR (5 rounds; half an hour)",
+    "networks": "D2-Net, MixVPR, ALIKED beside torch; NetVLAD, Patch-NetVLAD, ResNet-50, SelaVPR (5 rounds; 30 min)",
     "accelerator": "correct and fast on a GPU? All steps beside torch there (10 rounds)",
     "localize": "maps of 1,000 and 10,000 images: time from image file to prediction (3 rounds)",
 }

@@ -38,7 +38,7 @@ NETWORKS = {  # checkpoint -> side of the images in px, result; weights are rand
 }
 
 
-class Task(NamedTuple):
+class Check(NamedTuple):
     """A check: `compute` returns the device's result and its reference, which deviate by a share `allowed` at most.
 
     It may return how many entries differ, without ties of float32.
@@ -51,11 +51,11 @@ class Task(NamedTuple):
 
 def check_all(*, is_small: bool) -> list[dict[str, Any]]:
     """Rows of all checks; several run at the same time, since most of the time is compiling."""
-    tasks = [*matching_tasks(), *scoring_tasks(), *search_tasks(), *network_tasks(is_small=is_small)]
-    return list(ordered_map(check, tasks, workers=available_cpus()))
+    all_checks = [*matching_checks(), *scoring_checks(), *search_checks(), *network_checks(is_small=is_small)]
+    return list(ordered_map(check, all_checks, workers=available_cpus()))
 
 
-def check(task: Task) -> dict[str, Any]:
+def check(task: Check) -> dict[str, Any]:
     """Row of a check: the greatest deviation, relative to the largest entry of the reference."""
     result, expected, differ = (*task.compute(), 0)[:3]
     result, expected = (np.asarray(values, np.float64) for values in (result, expected))
@@ -99,20 +99,20 @@ def matches(**options: Any) -> Matches:
         return jax.tree.map(np.asarray, mfvpr.match_candidates(*images(), **options))
 
 
-def matching_tasks() -> Iterator[Task]:
+def matching_checks() -> Iterator[Check]:
     """Products and matches."""
     for product in ("bfloat16", "float32"):
-        yield Task(f"matches, {product}", partial(match, images(), product))
+        yield Check(f"matches, {product}", partial(match, images(), product))
     query, candidate = images()[0].descriptors, images()[1].descriptors[0]
     expected = query.astype(np.float64) @ candidate.astype(np.float64).T
-    yield Task("products of descriptors", lambda: (jax.jit(products)(query, candidate), expected), 1e-6)
+    yield Check("products of descriptors", lambda: (jax.jit(products)(query, candidate), expected), 1e-6)
 
 
 def match(images: tuple[Features, Features], product: Any = None, rounded: Any = None) -> tuple[Any, ...]:
     """Distances and ratios of matches, and how many keypoints have another match than `images` in float64."""
-    found = mfvpr.match_candidates(*(rounded or images), with_ratio=True, product=product, chunk_size=1)
-    found = jax.tree.map(np.asarray, found)
-    neighbors, references = np.where(found.mask, found.index1, -1), []
+    on_device = mfvpr.match_candidates(*(rounded or images), with_ratio=True, product=product, chunk_size=1)
+    result = jax.tree.map(np.asarray, on_device)
+    neighbors, references = np.where(result.mask, result.index1, -1), []
     query, rows = images[0].descriptors.astype(np.float64), np.arange(neighbors.shape[1])
     for candidate in images[1].descriptors.astype(np.float64):
         similarity = query @ candidate.T
@@ -125,22 +125,22 @@ def match(images: tuple[Features, Features], product: Any = None, rounded: Any =
     expected, is_tie, *numbers = (np.stack(values) for values in zip(*references, strict=True))
     compared = (neighbors == expected) & (neighbors >= 0) & ~is_tie
     differ = int(np.sum((neighbors != expected) & ~is_tie))
-    return np.where(compared, [found.distance, found.ratio], 0), np.where(compared, numbers, 0), differ
+    return np.where(compared, [result.distance, result.ratio], 0), np.where(compared, numbers, 0), differ
 
 
-def scoring_tasks() -> Iterator[Task]:
+def scoring_checks() -> Iterator[Check]:
     """Scores, grids and gradients."""
     pairs, cells = matches(with_ratio=True), matches(cross_check="candidate")
     for name, scorer in SCORERS.items():
         if not hasattr(scorer, "score_pairs"):  # those are on the host
             scorer, of = (scorer(side=SIDE), cells) if name == "grid" else (scorer(), pairs)
-            yield Task(f"score {name}", partial(beside_float64, partial(mfvpr.score_candidates, scorer), of))
+            yield Check(f"score {name}", partial(beside_float64, partial(mfvpr.score_candidates, scorer), of))
     for scorer, axes in GRIDS.items():
         compute = partial(beside_float64, partial(mfvpr.score_grid, scorer, **axes), pairs)
-        yield Task(f"grid of {type(scorer).__name__}", compute)
+        yield Check(f"grid of {type(scorer).__name__}", compute)
     for scorer, allowed in SMOOTH.items():
         compute = partial(beside_float64, jax.jit(partial(_gradient, scorer)), *images())
-        yield Task(f"gradient of {type(scorer).__name__}", compute, allowed)
+        yield Check(f"gradient of {type(scorer).__name__}", compute, allowed)
 
 
 def _gradient(scorer: Any, query: Features, candidates: Features) -> jax.Array:
@@ -155,7 +155,7 @@ def _gradient(scorer: Any, query: Features, candidates: Features) -> jax.Array:
     return jnp.concatenate([gradient / jnp.max(jnp.abs(gradient)) for gradient in gradients], axis=1)
 
 
-def search_tasks() -> Iterator[Task]:
+def search_checks() -> Iterator[Check]:
     """Exact search."""
     rng, count = np.random.default_rng(0), 20_000
     rows = rng.normal(size=(count, DIMENSION))
@@ -171,14 +171,14 @@ def search_tasks() -> Iterator[Task]:
         return candidates.scores, expected, int(np.sum(np.abs(similarities - expected) > TIE))
 
     for name, function in (("retrieve", mfvpr.retrieve), ("ExactSearch", ExactSearch().shortlist)):
-        yield Task(f"search, {name}", partial(search, function), 2e-6)
+        yield Check(f"search, {name}", partial(search, function), 2e-6)
 
 
-def network_tasks(*, is_small: bool) -> Iterator[Task]:
+def network_checks(*, is_small: bool) -> Iterator[Check]:
     """Networks on one image; the small check is of ALIKED alone."""
     for checkpoint, (side, function) in [*NETWORKS.items()][: 1 if is_small else None]:
         compute = partial(_network, checkpoint, 64 if is_small else side, function)
-        yield Task(f"{checkpoint}, random weights", compute, 1e-4)  # TF32 deviates by more
+        yield Check(f"{checkpoint}, random weights", compute, 1e-4)  # TF32 deviates by more
 
 
 def _network(checkpoint: str, side: int, function: Callable[..., Any]) -> tuple[Any, Any]:

@@ -43,11 +43,11 @@ def measure(entries: Sequence[Entry], rounds: int) -> tuple[list[dict[str, Any]]
     caches, and their idle threads may still be spinning.
     """
     results, first_calls, seconds = {}, {}, {(step, name): list[float]() for step, name, _ in entries}
-    for step, name, call in progress("warm-up", len(entries), entries):
+    for step, name, call in progress("warm-up", entries):
         start = time.perf_counter()
         results[step, name] = call()
         first_calls[step, name] = time.perf_counter() - start
-    for _ in progress("rounds", rounds, range(rounds)):
+    for _ in progress("rounds", range(rounds)):
         for step, name, call in entries:
             times = seconds[step, name]
             for _ in range(min(REPEATED, int(QUICK / times[-1])) if times else 0):
@@ -57,15 +57,13 @@ def measure(entries: Sequence[Entry], rounds: int) -> tuple[list[dict[str, Any]]
     rows, lines = [], []
     for step, name in sorted(seconds, key=lambda entry: (steps.index(entry[0]), medians[entry])):
         low, median, high = (1e3 * float(np.quantile(seconds[step, name], share)) for share in (0.25, 0.5, 0.75))
-        ratio, first = (
-            medians[step, name] / medians[next(entry for entry in seconds if entry[0] == step)],
-            first_calls[step, name],
-        )
+        reference = next(entry for entry in seconds if entry[0] == step)
+        ratio, first = medians[step, name] / medians[reference], first_calls[step, name]
         rows.append(
             {"step": step, "name": name, "median_ms": median, "quartiles_ms": [low, high], "first_call_s": first}
         )
         lines.append([step, name, f"{median:.2f}", f"{low:.2f} .. {high:.2f}", f"{ratio:.2f}", f"{first:.1f}"])
-    header = ["step", "who", "median, ms", "quartiles, ms", "/ mfvpr", "first call, s"]
+    header = ["step", "implementation", "median, ms", "quartiles, ms", "/ mfvpr", "first call, s"]
     return rows, Table(header, lines, text_columns=2), results
 
 

@@ -63,7 +63,7 @@ def _fill(street_map: Map, images: ImageFolder, size: int) -> None:
     describing, rng = street_map.describing, np.random.default_rng(0)
     describer: Any = describing.describer
     described = [image for batch in describing.folder(images, FeatureCache()) for image in batch.values()]
-    for start in progress(f"map of {size}", size // BATCH, range(0, size, BATCH)):
+    for start in progress(f"map of {size}", range(0, size, BATCH)):
         features = [_with_noise(described[row % len(described)][0], rng) for row in range(start, start + BATCH)]
         entries = [Entry(str(start + row), start + row, vector) for row, vector in enumerate(describer(features))]
         street_map.add_described(entries, features)

@@ -139,10 +139,8 @@ def rows_of(features: Features, index: Any) -> Features:
 
 def matching_entries(candidates: int, keypoints: int, dimension: int) -> list[Entry]:
     """One query with its candidates: mutual nearest neighbors and their distances."""
-    step, (images, views) = (
-        f"matching, {candidates} x {keypoints} x {dimension}",
-        scene(candidates, keypoints, dimension),
-    )
+    step = f"matching, {candidates} x {keypoints} x {dimension}"
+    images, views = scene(candidates, keypoints, dimension)
     query, match = rows_of(views, 0), mfvpr.match_candidates
     sides = query.descriptors, images.descriptors
     product = jax.jit(partial(jnp.einsum, "nd,cmd->cnm", precision=EXACT))
@@ -157,10 +155,8 @@ def matching_entries(candidates: int, keypoints: int, dimension: int) -> list[En
 
 def host_matching_entries(candidates: int, keypoints: int, dimension: int) -> list[Entry]:
     """The same by float32 alone, by OpenCV's cross-check, and by FAISS's exact search both ways, pair by pair."""
-    step, (images, views) = (
-        f"matching, {candidates} x {keypoints} x {dimension}",
-        scene(candidates, keypoints, dimension),
-    )
+    step = f"matching, {candidates} x {keypoints} x {dimension}"
+    images, views = scene(candidates, keypoints, dimension)
     query = rows_of(views, 0)
     descriptors0, all_descriptors1 = np.asarray(query.descriptors), np.asarray(images.descriptors)
     matcher = cv2.BFMatcher(cv2.NORM_L2, crossCheck=True)

@@ -107,7 +107,7 @@ def search(queries: Tensor, database: Tensor, *, candidates: int) -> Tensor:
 def rank(rows: Tensor, *fields: Tensor) -> Tensor:
     """Rankings of candidates `[Q, C]` by histograms; fields are points, descriptors and scores of both sides."""
     rankings, centers = [], bin_centers(BIN, rows.device)
-    for row in rows:  # of the candidates of a query, whose number is that of the first
+    for row in rows:  # candidates of a query; the query is the view of the first
         points0, query, scores0 = (field[row[0]] for field in fields[:3])
         points1, candidates, scores1 = (field[row] for field in fields[3:])
         nearest1, mutual = match(query, candidates)

@@ -88,8 +88,8 @@ def input_fingerprints(settings: Evaluate, images: Mapping[str, str], truth: str
 
 
 def is_finished_with(inputs: Mapping[str, str], folder: Path) -> bool:
-    """Whether a run of these inputs is finished there; InputError for one of other inputs."""
-    if not (folder / LAST).is_file():
+    """Whether a run of these inputs is finished there; InputError for one of other inputs. A damaged run is not."""
+    if read_json(folder / LAST) is None or read_json(folder / SIZES) is None:
         return False
     before = read_json(folder / INPUTS) or {}
     if other := [name for name, value in inputs.items() if before.get(name) != value]:

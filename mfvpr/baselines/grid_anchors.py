@@ -37,9 +37,7 @@ class GridAnchors:
 
     side: int = setting(40, whole(1, 74), "as the features have", unit="cells per side", swept=False, static=True)
     patch: int | None = setting(None, whole(1, 73) | None, "odd; None = 3/4 of the side", unit="cells", static=True)
-    outside: str = setting(
-        "unequal", one_of("unequal", "zero"), "the grid, of the CPU and of the GPU path", static=True
-    )
+    outside: str = setting("unequal", one_of("unequal", "zero"), "padding, as its code on a CPU or GPU", static=True)
 
     def __post_init__(self) -> None:
         check_fields(self)

@@ -63,8 +63,8 @@ def install(checkpoint: Path, name: str, *, own: str | None = None) -> Path:
         with reading(checkpoint, "a safetensors file"):
             table, tensors = RUNTIME, _read(checkpoint)[1]
     else:
-        tensors = read_checkpoint(checkpoint)
         check_sha256(checkpoint, entry, checkpoint)
+        tensors = read_checkpoint(checkpoint)
     plan = blueprint(entry)
     try:
         arrays = convert(tensors, table, plan.shapes)
@@ -149,7 +149,8 @@ def read_provenance(name: str) -> dict[str, Any]:
 
 def installed_entry(name: str) -> Entry:
     """`entry_of`, also for installed weights of your own (`own/<name>`)."""
-    return {entry.name: entry for entry in own_entries()}.get(name) or entry_of(name)
+    own = {entry.name: entry for entry in own_entries()} if name.startswith(OWN) else {}
+    return own.get(name) or entry_of(name)
 
 
 def own_entries() -> list[Entry]:

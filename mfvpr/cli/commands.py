@@ -111,7 +111,7 @@ def download_weights(name: str) -> None:
     else:
         try:
             with replacing(target) as temporary, urlopen(entry.source, timeout=30) as response:
-                with temporary.open("wb") as file, progress(entry.file, entry.size or 0) as bar:
+                with temporary.open("wb") as file, progress(entry.file, total=entry.size) as bar:
                     while (chunk := response.read(_CHUNK)) and not (entry.size and bar.n > entry.size):
                         bar.update(file.write(chunk))
                 check_sha256(temporary, entry, entry.source)

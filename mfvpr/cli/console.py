@@ -73,16 +73,13 @@ def refuse(reason: str) -> NoReturn:
 
 def track(label: str) -> "Track":
     """Progress of a loop with the time left."""
-    return lambda items, total: progress(label, total, items)
+    return lambda items, total: progress(label, items, total)
 
 
-def progress(label: str, total: int, items: Iterable[Any] | None = None) -> "tqdm[Any]":
-    """Progress with the time left, of loops of more than two seconds: a line that is overwritten in a terminal.
-
-    `total` is 0 if it is not known.
-    """
+def progress(label: str, items: Iterable[Any] | None = None, total: int | None = None) -> "tqdm[Any]":
+    """Progress with the time left, of loops of more than two seconds: a line that is overwritten in a terminal."""
     from tqdm import tqdm
 
     is_terminal = sys.stderr.isatty()
     interval = 0.1 if is_terminal else 10  # seconds between two lines
-    return tqdm(items, label, total or None, leave=not is_terminal, mininterval=interval, miniters=1, delay=2)
+    return tqdm(items, label, total, leave=not is_terminal, mininterval=interval, miniters=1, delay=2)

@@ -10,7 +10,7 @@ from typing import Any, TypeVar
 
 from mfvpr import datasets
 from mfvpr.baselines.learned_weight import provenance
-from mfvpr.cli.console import progress, tell, track, warn
+from mfvpr.cli.console import tell, track, warn
 from mfvpr.cli.schema import Common, RecallSettings
 from mfvpr.core.types import Shortlist
 from mfvpr.datasets import Dataset, IndexFile, LabelFiles, QuerySequence
@@ -68,7 +68,7 @@ class Inputs:
 
     def match(self, watch: Stopwatch) -> tuple[MatchSet | Scales, Shortlist]:
         """Matches and shortlist of the only sequence, from their store if it has all of them."""
-        result = match_sequence(self.dataset, self.dataset.only, self.pipeline, cache=self.cache, watch=watch)
+        result = match_sequence(self.dataset, self.dataset.only, self.pipeline, cache=replace(self.cache, watch=watch))
         return result.by_scale, result.candidates
 
     def matches_recipe(self) -> dict[str, Any]:
@@ -129,13 +129,7 @@ def dataset_of(settings: Mapping[str, Any]) -> Dataset:
     """The data set; the synthetic street is drawn first if the cache does not have it."""
     if "cache" in settings:
         seasons, root = settings["name"] == "streets_seasons", expand_user(settings["cache"])
-        with progress("drawing streets", 0) as bar:
-
-            def reach(number: int, total: int) -> None:
-                bar.total = total
-                bar.update(number - bar.n)
-
-            root = streets_folder(root, seasons=seasons, seed=settings["seed"], progress=reach)
+        root = streets_folder(root, seasons=seasons, seed=settings["seed"], progress=track("drawing streets"))
         queries = [root / name for name in CONDITIONS] if seasons else root / "queries"
         truth = IndexFile(TRUTH if seasons else root / TRUTH, is_widened=True)
         return datasets.folder(root / "database", queries, ground_truth=truth, name=settings["name"])

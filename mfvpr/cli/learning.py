@@ -3,6 +3,7 @@
 import itertools
 from collections.abc import Mapping
 from dataclasses import replace
+from importlib.metadata import version
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -152,7 +153,7 @@ def _checkpoints(settings: Learn, axes: Axes, data: Part, sets: list[Prepared]) 
         "retrieval_score": settings.fusion.retrieval_score,
         "positives": data.protocol.fingerprint,
         "reported": dict(data.protocol.reported_sets),
-        "versions": {name: versions()[name] for name in ("mfvpr", "jax", "numpy")},
+        "versions": {**{name: versions()[name] for name in ("mfvpr", "jax", "numpy")}, "optax": version("optax")},
     }
     return Checkpoints(expand_user(root), recipe)
 

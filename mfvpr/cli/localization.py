@@ -147,8 +147,10 @@ class _Drive:
                 warn(f"{path}: not drawn ({error})")
 
     def _route_entry(self, located: Located | None) -> dict[str, Any]:
-        if self._route is None or located is None:
-            return {} if self._route is None else {"route": None}
+        if self._route is None:
+            return {}
+        if located is None:
+            return {"route": None}
         numbers = {"p": round(located.p, 4), "advance": round(located.advance, 2), "off": round(located.off, 4)}
         return {"route": {"place": located.row if located.row is None else self._map.place(located.row)} | numbers}
 

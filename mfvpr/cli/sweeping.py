@@ -55,14 +55,14 @@ def sweep_program(settings: Settings) -> None:
         matches, candidates = inputs.match(watch)
         method = settings.sequence
         options = SweepOptions(
-            settings.recall.ks,
-            settings.ties,
-            settings.fusion.retrieval_score,
-            method and DriveRanking.of(DriveFilter(method), inputs.dataset, protocol),
-            settings.chunk.settings,
-            settings.chunk.queries,
-            expand_user(settings.cache) if settings.cache else None,
-            inputs.cache.runtime,
+            ks=settings.recall.ks,
+            ties=settings.ties,
+            retrieval_score=settings.fusion.retrieval_score,
+            sequence=method and DriveRanking.of(DriveFilter(method), inputs.dataset, protocol),
+            settings_per_block=settings.chunk.settings,
+            queries_per_block=settings.chunk.queries,
+            folder=expand_user(settings.cache) if settings.cache else None,
+            runtime=inputs.cache.runtime,
         )
         with watch("sweep"):
             if settings.search == "grid":
@@ -91,7 +91,8 @@ def sweep_program(settings: Settings) -> None:
             write=lambda new: sweeps.write_sweep(new, outcome, heading, results),
             figures=sweeps.sweep_figures(outcome),
         )
-        forget_rankings(axes.scorer, matches, candidates, outcome.protocol.views, options)
+        ranked = [axes.setting(plain) for plain in outcome.settings]
+        forget_rankings(axes.scorer, ranked, matches, candidates, outcome.protocol.views, options)
 
 
 def axes_of(settings: Searched) -> Axes:
@@ -191,7 +192,7 @@ def sweep(
         ties=system.ties,
         retrieval_score=system.fused[name].retrieval_score if name in system.fused else "cosine",
         sequence=DriveRanking.of(filters[0], dataset, protocol) if filters else None,
-        folder=None if out is None else _block_folder(Path(out), swept),
+        folder=None if out is None else _ranking_folder(Path(out), swept),
         runtime=runtime or cache.runtime,
     )
     matched = match_sequence(dataset, sequence, system.pipeline, cache=cache, runtime=options.runtime)
@@ -215,12 +216,12 @@ def _only_scorer(system: System) -> tuple[str, Scorer, float | str | None]:
     raise InputError(f"system: expected {expected}, got {got}; sweep mfvpr.System(system.pipeline, {{name: scorer}})")
 
 
-def _block_folder(out: Path, axes: Axes) -> Path:
-    """The folder of finished blocks, in a new or empty folder or in one of this sweep."""
-    blocks, results = out / "blocks", out / LAST
-    if not blocks.is_dir() and out.exists() and (not out.is_dir() or any(out.iterdir())):
+def _ranking_folder(out: Path, axes: Axes) -> Path:
+    """The folder of the rankings by finished settings, in a new or empty folder or in one of this sweep."""
+    rankings, results = out / "rankings", out / LAST
+    if not rankings.is_dir() and out.exists() and (not out.is_dir() or any(out.iterdir())):
         raise InputError(f"out={out}: expected a new or empty folder, or one of a sweep; name another")
     if results.exists() and json.loads(results.read_text("utf-8"))["axes"] != axes_json(axes):
         raise InputError(f"out={out}: has the result of a sweep of other axes; name another folder")
-    blocks.mkdir(parents=True, exist_ok=True)
-    return blocks
+    rankings.mkdir(parents=True, exist_ok=True)
+    return rankings

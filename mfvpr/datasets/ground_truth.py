@@ -14,10 +14,10 @@ from dataclasses import dataclass
 from functools import partial
 from itertools import chain
 from pathlib import Path, PurePosixPath
-from typing import ClassVar, Literal
+from typing import Any, ClassVar, Literal
 
 import numpy as np
-from jaxtyping import Float, Int, Num
+from jaxtyping import Float, Float64, Int, Num
 
 from mfvpr.datasets.positives import Positives, rows_within
 from mfvpr.io.containers import parse_number, read_npz, reading, shorten
@@ -208,12 +208,13 @@ class AllowedTruth(Truth):
         return distance
 
 
-def require_positions(where: str, xy: np.ndarray, count: int) -> None:
-    """Raise an InputError unless there is a position in meters for each of `count` images."""
+def require_positions(where: str, xy: Any, count: int) -> Float64[np.ndarray, "images 2"]:
+    """Positions in meters as float64; an InputError unless there is one for each of `count` images."""
     xy = np.asarray(xy, np.float64)
     if xy.shape != (count, 2) or not (np.abs(xy) <= FARTHEST).all():  # NaN neither
         got = f"{[*xy.shape]} up to {np.abs(xy).max(initial=0):g} m"
         raise InputError(f"{where}: expected positions [{count}, 2] of all images, at most {FARTHEST:g} m, got {got}")
+    return xy
 
 
 def truth_from_names(query_names: Sequence[str], database_names: Sequence[str]) -> RadiusTruth:
@@ -228,8 +229,7 @@ def truth_from_names(query_names: Sequence[str], database_names: Sequence[str]) 
                 mend = "or choose another ground truth"
                 raise InputError(f"{name}: expected a name like @easting@northing@..., in meters; {mend}") from None
             positions.append((easting, northing))
-        sides.append(np.array(positions))
-        require_positions("positions in names", sides[-1], len(names))
+        sides.append(require_positions("positions in names", positions, len(names)))
     return RadiusTruth(*sides)
 
 

@@ -29,9 +29,11 @@ class Positives:
     matrix: "scipy.sparse.csr_array"
 
     def __post_init__(self) -> None:
-        matrix = scipy.sparse.csr_array(self.matrix, dtype=bool, copy=True)
-        matrix.sum_duplicates()  # and sort each query's rows
-        matrix.eliminate_zeros()
+        matrix = scipy.sparse.csr_array(self.matrix, dtype=bool)
+        if not matrix.has_canonical_format or not matrix.data.all():
+            matrix = matrix.copy()  # of the caller, perhaps
+            matrix.sum_duplicates()  # and sort each query's rows
+            matrix.eliminate_zeros()
         object.__setattr__(self, "matrix", matrix)
 
     @classmethod
@@ -42,7 +44,7 @@ class Positives:
         if flat.dtype.kind not in "iu" or (flat.size and not 0 <= flat.min() <= flat.max() < num_database):
             got = f"{flat.dtype} from {flat.min()} to {flat.max()}; from_matrix takes matrices"
             raise InputError(f"positives: expected rows of a database of {num_database} images, got {got}")
-        offsets = np.cumsum([0, *map(len, per_query)], dtype=np.int64)
+        offsets = np.cumsum([0, *map(len, per_query)], dtype=np.int32 if len(flat) < 2**31 else np.int64)
         content = np.ones(len(flat), bool), flat.astype(np.int32, copy=False), offsets
         return cls(scipy.sparse.csr_array(content, shape=(len(per_query), num_database)))
 
@@ -53,6 +55,11 @@ class Positives:
         if matrix.ndim != 2:
             raise InputError(f"positives: expected a matrix [queries, database], got shape {matrix.shape}")
         return cls(scipy.sparse.csr_array(matrix))
+
+    @property
+    def recipe(self) -> dict[str, Any]:
+        """What determines the positives, see `mfvpr.utils.recipe_of`."""
+        return {"rows": self.rows, "offsets": self.offsets, "num_database": self.num_database}
 
     @property
     def rows(self) -> Int[np.ndarray, " _"]:

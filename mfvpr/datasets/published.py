@@ -5,7 +5,7 @@ import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
-from itertools import product
+from itertools import product, zip_longest
 from pathlib import Path, PurePosixPath
 
 import numpy as np
@@ -134,8 +134,9 @@ def equal_frames(database: ImageFolder, queries: ImageFolder) -> Content:
     """Frames of equal names show the same place; each folder of the database is a drive."""
     stems = [[PurePosixPath(image).with_suffix("") for image in folder.names] for folder in (database, queries)]
     if stems[0] != stems[1]:
-        alone = sorted({*stems[0]} ^ {*stems[1]})
-        got = f"{len(queries):,} and {len(database):,} frames, first {alone[0]} alone"
+        pairs = zip_longest(*stems, fillvalue="none")
+        differing = next(f"{first} and {second}" for first, second in pairs if first != second)
+        got = f"{len(queries):,} and {len(database):,} frames, the first that differ are {differing}"
         raise InputError(f"{queries.root}: expected the frames of {database.root}, got {got}; get the whole data set")
     drives = [stem.parent for stem in stems[0]]
     starts = tuple(row for row in range(1, len(drives)) if drives[row] != drives[row - 1])
@@ -195,9 +196,8 @@ def pitts30k(root: Path, name: str) -> Content:
     if not structures:
         truths = [path for path in (root / f"{name}_gt_25m.npy", root / f"{name}_gt.npy") if path.exists()]
         if not truths:
-            raise InputError(
-                f"{root}: expected datasets/{name}.mat, or lists {name}_gt.npy ...; get the whole data set"
-            )
+            lists = f"{name}_gt.npy with {name}_dbImages.npy and {name}_qImages.npy"
+            raise InputError(f"{root}: expected datasets/{name}.mat, or {lists}; get the whole data set")
         return content_of_lists(root, root / f"{name}_dbImages.npy", root / f"{name}_qImages.npy", truths[0])
     names, positions = [], []
     with reading(structures[0], mend=f"expected the structure dbStruct of {name}"), structures[0].open("rb") as file:
@@ -230,7 +230,7 @@ def msls_val(root: Path) -> Content:
                 tables.append({line["key"]: line for line in lines})
                 if len(tables[-1]) < len(lines) or tables[-1].keys() != tables[0].keys():
                     raise ValueError("expected equal keys in all tables, each once")
-        mend = "expected equal keys in all three tables, and pano, all (True or False), easting, northing"
+        mend = "expected pano and all (True or False), easting, northing"
         with reading(folder / "postprocessed.csv", mend=mend):
             processed, raw, tasks = tables
             for key, line in processed.items():

@@ -21,6 +21,7 @@ from mfvpr.core.scorer import Scorer
 from mfvpr.core.types import Array
 from mfvpr.deployment.programs import ExportShapes, Program, Tensor, make_program
 from mfvpr.evaluation.system import System
+from mfvpr.io.containers import reading
 from mfvpr.utils.errors import InputError
 from mfvpr.utils.files import require_file, write_text
 from mfvpr.utils.fingerprints import recipe_of, versions
@@ -107,8 +108,8 @@ def export(
             model, or its outputs differ; or the folder has files.
     """
     folder = Path(folder)
-    if folder.exists() and any(folder.iterdir()):
-        raise InputError(f"{folder}: expected a new or an empty folder, got one with files; choose a new path")
+    if folder.exists() and not (folder.is_dir() and not any(folder.iterdir())):
+        raise InputError(f"{folder}: expected a new or an empty folder; choose a new path")
     options = {"with_shift": with_shift, "with_confidence": with_confidence}
     with jax.enable_x64(False):
         program = without_unused_inputs(make_program(method, shapes, **options))
@@ -169,9 +170,10 @@ def load_exported(folder: Path | str) -> ExportedProgram:
     folder = Path(folder)
     require_file(path := folder / DESCRIPTION, "a folder of mfvpr.export with this file")
     require_file(folder / PROGRAM)
-    description = json.loads(path.read_text(encoding="utf-8"))
-    if description["format"] != FORMAT:
-        raise InputError(f"{path}: expected the format {FORMAT!r}; export it again with this version")
+    with reading(path, mend="export it again"):
+        description = json.loads(path.read_text(encoding="utf-8"))
+        if description["format"] != FORMAT:
+            raise InputError(f"expected the format {FORMAT!r}; export it again with this version")
     exported = deserialize((folder / PROGRAM).read_bytes(), str(folder / PROGRAM))
     inputs, outputs = (
         tuple(Tensor(**entry | {"shape": tuple(entry["shape"])}) for entry in description[side])

@@ -127,17 +127,18 @@ def make_program(
         if main not in method.scorers:
             got = "a ranking that needs the retrieval or further queries; choose another with dataclasses.replace"
             raise InputError(f"final={main!r}: expected a scorer, got {got}")
-        others = {f"scores_{name}": scorer for name, scorer in method.scorers.items() if name != main}
-        scorers = {"scores": method.scorers[main], **others}
+        scorers = {"scores": method.scorers[main]}
+        scorers |= {f"scores_{name}": scorer for name, scorer in method.scorers.items() if name != main}
         left_out = tuple(name for name in method.final_scores if name not in method.scorers)
     else:
         scorers = {"scores": method}
-    for scorer in scorers.values():
+    for name, scorer in scorers.items():
         if on_host(scorer):
-            name = type(scorer).__name__
-            raise InputError(
-                f"{name}: expected a scorer that JAX compiles, not on the host (score_pairs); leave it out"
-            )
+            kind, expected = type(scorer).__name__, "a scorer that JAX compiles, not on the host (score_pairs)"
+            raise InputError(f"{kind}: expected {expected}; leave it out")
+        if not name.isidentifier():  # the name of a file
+            got = name.removeprefix("scores_")
+            raise InputError(f"scorers: expected names of letters, digits and _, got {got!r}; rename the scorer")
     if with_shift and not isinstance(scorers["scores"], HistogramOfShifts):
         got = type(scorers["scores"]).__name__
         raise InputError(f"with_shift=True: expected a HistogramOfShifts that decides, got {got}; leave with_shift out")
@@ -164,15 +165,15 @@ def make_program(
             return _over(lambda candidate: score(match(candidate)), candidates, form)
         return jax.vmap(score)(jax.lax.map(match, candidates))  # one similarity matrix at a time
 
-    outputs = {name: ("C", "float32", "") for name in scorers}
-    outputs |= {"shift": ("C2", "float32", "px")} if with_shift else {}
+    output_table = {name: ("C", "float32", "") for name in scorers}
+    output_table |= {"shift": ("C2", "float32", "px")} if with_shift else {}
     lengths = {"C": shapes.candidates, "K": shapes.keypoints, "D": shapes.dimension or 0, "2": 2}
     inputs, outputs = (
         tuple(
             Tensor(name, tuple(lengths[axis] for axis in axes), dtype, unit, axes)
             for name, (axes, dtype, unit) in tensors.items()
         )
-        for tensors in (table, outputs)
+        for tensors in (table, output_table)
     )
     parts = scorers if matcher is None else {**scorers, "matcher": matcher}
     return Program(shapes, inputs, outputs, score_features if matcher else score_matches, parts, left_out)

@@ -22,7 +22,7 @@ from mfvpr.utils.files import require_file, require_replaceable, write_text
 APART = 5  # rows of the database, by default
 REFUSALS = 0.2, 0.5  # shares of images without enough evidence, by default
 AROUND = 5  # times the distance of a correct prediction: nearer images show the place, or are not known to be elsewhere
-_LEAST_WEIGHT = 1e-9  # of an input: less is a rest of the optimization, which would order equal predictions by rounding
+_LEAST_WEIGHT = 1e-9  # of an input: smaller ones are rounding errors, which would order equal predictions
 _FORMAT = "mfvpr confidence 3"
 _LEAST_SPREAD = 1e-3  # of the first score: less is rounding
 _PRIOR = 2  # added candidates of other places, with the variance of all candidates
@@ -192,7 +192,7 @@ def confidence_from_json(values: Mapping[str, Any]) -> Confidence:
     vectors = {name: tuple(values[name]) for name in ("center", "scale", "weights", "refusals")}
     numbers = np.array([*vectors.values()], float)  # [4, 2]: two inputs, two shares
     _, scale, weights, shares = numbers
-    is_fitted = numbers.shape == (4, 2) and np.isfinite(numbers).all() and np.isfinite(values["bias"])
+    is_fitted = numbers.shape == (4, 2) and np.isfinite([*numbers.flat, values["bias"], values["apart"]]).all()
     if not (is_fitted and min(*scale, *shares) > 0 and min(weights) >= 0 and max(shares) <= 1):
         raise ValueError("values that make no model")
     return Confidence(**{**values, **vectors})

@@ -144,7 +144,7 @@ def rank_dataset(
         keep_compiled_programs()
     system = system.fit_image_size(folders_of(dataset), cache.warn)
     systems = dict[str, list[Ranked]]()
-    matched = [match_sequence(dataset, each, system.pipeline, cache=cache, watch=watch) for each in dataset.sequences]
+    matched = [match_sequence(dataset, each, system.pipeline, cache=cache) for each in dataset.sequences]
     for sequence in matched:
         with watch("scores"):
             scores = stages.score(system.scorers, sequence.by_scale, sequence.candidates, runtime=cache.runtime)
@@ -177,15 +177,15 @@ def match_sequence(
     *,
     cache: FeatureCache | None = None,
     runtime: Runtime | None = None,
-    watch: Stopwatch | None = None,
 ) -> Matched:
     """Find and match the candidates of one sequence's queries; features of other database images are not extracted.
 
-    If the cache has a root, matches are kept below it. If they are all there, nothing else is read. `watch` gets the
-    seconds of the stages; the other arguments and the errors are those of `mfvpr.evaluate`.
+    If the cache has a root, matches are kept below it. If they are all there, nothing else is read. The watch of the
+    cache gets the seconds of the stages; arguments and errors are those of `mfvpr.evaluate`.
     """
-    cache, watch, database = cache or FeatureCache(), watch or Stopwatch(), dataset.database
-    cache = replace(cache, runtime=runtime or cache.runtime, watch=cache.watch or watch)
+    cache, database = cache or FeatureCache(), dataset.database
+    watch = cache.watch or Stopwatch()
+    cache = replace(cache, runtime=runtime or cache.runtime, watch=watch)
     if pipeline.pixels is not None:
         pipeline = pipeline.with_image_size(pipeline.size_for_images(folders_of(dataset), cache.warn))
     if pipeline.image_source is None:
@@ -199,8 +199,8 @@ def match_sequence(
     if recipe is not None and cache.root is not None:
         scales = range(len(pipeline.scales))
         stores = [MatchStore(cache.root, recipe | {"scale": scale}, len(sequence.images)) for scale in scales]
-    kept = _read_matches(sequence, stores, cache, watch) if stores else None
-    if kept is None:
+    stored = _read_matches(sequence, stores, cache, watch) if stores else None
+    if stored is None:
         with watch("retrieval"):
             retrieved = retriever.shortlist(sequence, database, number, cache)
             retrieved = _check_candidates(retrieved, type(retriever).__name__, (len(sequence.images), number), database)
@@ -214,8 +214,8 @@ def match_sequence(
                 stages.match(*scale, retrieved.candidates, pipeline.matcher, store=store, runtime=cache.runtime)
                 for scale, store in zip(sides, stores or [None] * len(sides), strict=True)
             )
-        kept = matches, retrieved.candidates, remarks
-    matches, candidates, remarks = kept
+        stored = matches, retrieved.candidates, remarks
+    matches, candidates, remarks = stored
     for line in remarks["warnings"]:
         cache.warn(line)
     sides = "queries", "database"
@@ -251,7 +251,7 @@ def matches_recipe(
         "candidates": num_candidates(pipeline.candidates, database),
         "matching": cache.recipes.of(pipeline.matcher),
         "skip_bad": cache.skip_bad,
-        "excluded": None if excluded is None else recipe_of([excluded.rows, excluded.offsets]),
+        "excluded": recipe_of(excluded),
     }
 
 

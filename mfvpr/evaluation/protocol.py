@@ -14,7 +14,7 @@ from mfvpr.core.types import Shortlist
 from mfvpr.datasets.ground_truth import Truth, Unit, threshold_words
 from mfvpr.datasets.positives import Positives, stack_positives
 from mfvpr.utils.errors import InputError
-from mfvpr.utils.fingerprints import content_hash
+from mfvpr.utils.fingerprints import fingerprint, recipe_of
 
 Split = Literal["first_half", "second_half", "both"]
 _HALVES = ("first_half", "second_half")
@@ -149,7 +149,7 @@ class EvaluationProtocol:
     @property
     def fingerprint(self) -> str:
         """Hash of the positives at each threshold."""
-        return content_hash([(positives.offsets, positives.rows) for positives in self.positives])
+        return fingerprint(recipe_of(list(self.positives)))
 
     def of(self, candidates: Shortlist) -> "EvaluationProtocol":
         """The protocol with the views of a shortlist."""
@@ -178,7 +178,7 @@ class EvaluationProtocol:
         """Recall@1 over the queries to choose on."""
         if not self.halves:
             return self.recall(rows[0])[None]
-        views = zip(rows[1:], self.halves, strict=False)
+        views = zip(rows[1:], self.halves, strict=True)
         return np.stack([self.hits(view[:, half.tune], half.tune).mean(axis=-1).T for view, half in views])
 
     def reported_hits(

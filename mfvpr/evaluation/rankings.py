@@ -117,9 +117,10 @@ class Fusion:
 
     def __call__(self, main: str, candidates: Shortlist, scores: Mapping[str, Scores]) -> Scores:
         """Combined scores, from scores by name of the scorer."""
+        by_retrieval = retrieval_scores(candidates, self.retrieval_score)
         if self.c != "zscore":
-            return fuse_shortlist(candidates, scores[main], self.c, retrieval_score=self.retrieval_score)
-        parts = {RETRIEVAL: retrieval_scores(candidates, self.retrieval_score)}
+            return np.asarray(fuse(by_retrieval, scores[main], candidates.mask, self.c))
+        parts = {RETRIEVAL: by_retrieval}
         parts |= {name: scores[name] for name in self.members(main)}
         weights = np.array([self.weights.get(name, 1.0) for name in parts], np.float32)
         return np.asarray(fuse_scales(np.stack([*parts.values()], axis=-1), candidates.mask, weights))
@@ -265,13 +266,6 @@ def fuse(
         c = jax.vmap(balancing_c)(retrieval_scores, scores, mask)[:, None]
     combined = combine(masked(retrieval_scores, mask), masked(scores, mask), c=c)
     return jnp.where(mask, combined, jnp.nan)
-
-
-def fuse_shortlist(
-    candidates: Shortlist, scores: Scores, c: float | None, *, retrieval_score: RetrievalScore = "cosine"
-) -> Scores:
-    """Combined scores of retrieval and re-ranking, see `fuse`."""
-    return np.asarray(fuse(retrieval_scores(candidates, retrieval_score), scores, candidates.mask, c))
 
 
 def retrieval_scores(candidates: Shortlist, kind: RetrievalScore = "cosine") -> Scores:

@@ -267,7 +267,7 @@ def dominant_shifts(
     Returns:
         Refined dominant shifts (candidate minus query), and their 95 % intervals (low, high); NaN if no match votes.
         Half the width of an interval is that of `HistogramOfShifts.shift_interval` and `SHIFT_FLOOR` of the resized
-        query's longer side, in quadrature. At last the sizes (width, height) of the resized queries, in px.
+        query's longer side, in quadrature. Sizes (width, height) of the resized queries, px.
     """
     fitted = fit_capacities(scorer, *match_set.image_sizes, multiple=BIN_STEP)
     shifts, intervals, sizes = (np.zeros((len(queries), *shape)) for shape in ((2,), (2, 2), (2,)))

@@ -22,7 +22,7 @@ class PathTest(NamedTuple):
     """Two systems on the same queries along a path, see `path_test`."""
 
     design_effect: float  # so many neighboring queries count as one; 1 = independent
-    p_value: float
+    p_value: float  # as McNemar's, for the effective number of queries
 
 
 class Estimate(NamedTuple):
@@ -61,9 +61,10 @@ def recall_interval(hits: np.ndarray) -> tuple[float, float]:
 def design_effect(hits: np.ndarray) -> float:
     """So many neighboring queries of a path count as one, in 1 ... Q (1 = independent), from hits `[Q]` bool.
 
-    This is the variance of the mean divided by that for independent queries, estimated from the autocorrelation. Few
-    hits or misses show little of that. The result is therefore (w estimate + 10 Q^(1/3)) / (w + 1) with
-    w = (n / estimate)^3 / 6 for n hits or misses, the rarer. These numbers were chosen by simulation.
+    This is the variance of the mean divided by the variance for independent queries, estimated from the
+    autocorrelation. Few hits or misses show little autocorrelation, so that the result is
+    (w estimate + 10 Q^(1/3)) / (w + 1) with w = (n / estimate)^3 / 6 for n hits or misses, the rarer. These numbers
+    were chosen by simulation.
     """
     hits = np.asarray(hits, np.float64)
     estimate = _variance_ratio(hits)
@@ -107,8 +108,8 @@ def _coin_p_value(heads: float, tails: float) -> float:
 def _variance_ratio(values: np.ndarray) -> float:
     """The design effect of values `[Q]`, in 1 ... Q, as in a Markov chain.
 
-    It is the larger one by the autocorrelation of neighboring queries, and of neighboring blocks of sqrt(Q) queries:
-    noise of single queries hides slow changes.
+    The larger of two estimates: from the autocorrelation of neighboring queries, and of neighboring blocks of sqrt(Q)
+    queries, since noise of single queries hides slow changes.
     """
     total, ratio = len(values), 1.0
     if total <= 3:

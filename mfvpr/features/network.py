@@ -130,7 +130,8 @@ class GlobalDescriptor(NetworkExtractor):
         self.model.require(self.image_size)
         most = self.model.dimension if self.model.has_components else 0
         if self.components is not None and self.components > most:
-            raise InputError(f"components={self.components}: expected null, or at most {most} of these weights")
+            expected = f"null, or at most {most}" if most else "null, as these weights have no principal components"
+            raise InputError(f"components={self.components}: expected {expected}")
 
     @property
     def vector_size(self) -> int:

@@ -49,16 +49,18 @@ class H5File:
         """For each image, its arrays among `parts`; their shapes alone, without reading values, if `shapes`."""
         with self._open() as file:
             for image in images:
-                datasets = {part: self._dataset(file, image, part) for part in parts if part in file[image]}
+                group = file[image]
+                datasets = {part: self._dataset(file, group, image, part) for part in parts if part in group}
                 yield {part: dataset.shape if shapes else dataset[()] for part, dataset in datasets.items()}
 
-    def _dataset(self, file: Any, image: str, part: str) -> Any:
-        dataset, where = file[image][part], f"{self.path}: {shorten(image)}/{part}"
+    def _dataset(self, file: Any, group: Any, image: str, part: str) -> Any:
+        dataset, where = group[part], f"{self.path}: {shorten(image)}/{part}"
         has_values = getattr(dataset, "shape", None) is not None and not dataset.external and not dataset.is_virtual
         is_here = has_values and dataset.file.filename == file.filename
         stored = dataset.id.get_storage_size() if is_here else 0
         if not is_here or (dataset.size and not stored):  # HDF5 would read zeros
-            raise InputError(f"{where}: expected data in this file, got none, a group or a link; extract it again")
+            got = "none, a group or a link; copy linked data into the file, or extract this image again"
+            raise InputError(f"{where}: expected data in this file, got {got}")
         if dataset.nbytes > max(MAX_INFLATED, stored):
             raise InputError(f"{where}: expected at most 1 GiB in a compressed dataset; write it uncompressed")
         return dataset

@@ -21,8 +21,18 @@ import numpy as np
 from jaxtyping import Float, Float32, Int32, Shaped
 
 from mfvpr.core.types import Array, Features
-from mfvpr.io import containers
-from mfvpr.io.containers import FileEntry, H5File, NpzFiles, as_float32, read_npz, shorten, write_h5, write_npz
+from mfvpr.io.containers import (
+    FileEntry,
+    H5File,
+    NpzFiles,
+    as_float32,
+    choose_reader,
+    read_npz,
+    reading,
+    shorten,
+    write_h5,
+    write_npz,
+)
 from mfvpr.io.names import match_names, match_paths, require_all, require_different
 from mfvpr.utils.errors import InputError, require_word
 from mfvpr.utils.files import printable, replacing, require_replaceable
@@ -94,16 +104,14 @@ class ImportedFeatures:
                 expected = "(width, height) in pixels" if argument is None else f"the argument {argument.tolist()}"
                 raise InputError(f"{where}: image_size: expected {expected}, got {size.tolist()}")
             require_inside(where, keypoints, size)
-            yield (
-                row,
-                Features(
-                    keypoints=np.ascontiguousarray(keypoints),
-                    descriptors=np.ascontiguousarray(_scaled(f"{where}: descriptors", descriptors, self._lengths)),
-                    scores=scores if scores.any() else np.ones(count, np.float32),
-                    mask=np.ones(count, bool),
-                    image_size=size,
-                ),
+            features = Features(
+                keypoints=np.ascontiguousarray(keypoints),
+                descriptors=np.ascontiguousarray(_scaled(f"{where}: descriptors", descriptors, self._lengths)),
+                scores=scores if scores.any() else np.ones(count, np.float32),
+                mask=np.ones(count, bool),
+                image_size=size,
             )
+            yield row, features
 
 
 def open_features(
@@ -140,15 +148,15 @@ def open_features(
             raise InputError(f"image_size: expected (width, height) in pixels, or [M, 2] of them, got {image_size}")
         sizes = np.broadcast_to(sizes, (len(names), 2))
     readers = {".h5": H5File, ".hdf5": H5File, ".npz": NpzFiles}
-    container: H5File | NpzFiles = (NpzFiles if path.is_dir() else containers.choose_reader(path, readers))(path)
+    container: H5File | NpzFiles = (NpzFiles if path.is_dir() else choose_reader(path, readers))(path)
     images = match_paths(path, names, paths, container.entries)
     if not partial or not any(images):
         require_all(path, names, images, "features")
     rows = {image: row for row, image in enumerate(images) if image is not None}
     counts, has_scores = np.full(len(names), -1, np.int32), set[bool]()
     layouts, dimensions = set[bool](), set[int]()  # whether descriptors are [D, N], and D
+    required = {"keypoints", "descriptors"} | ({"image_size"} if sizes is None else set())
     for (image, row), shapes in zip(rows.items(), container.read(rows, PARTS, shapes=True), strict=True):
-        required = {"keypoints", "descriptors"} if sizes is not None else {"keypoints", "descriptors", "image_size"}
         if missing := sorted(required - shapes.keys()):
             mend = "; give it as image_size=" if missing == ["image_size"] else ""
             raise InputError(f"{path}: {shorten(image)}: expected {', '.join(missing)}, got none{mend}")
@@ -252,13 +260,13 @@ def read_descriptors_with_entries(
     """Descriptors as `read_global_descriptors` returns them, and `[M]` the entry of each image."""
     path = Path(path)
     require_word("lengths", lengths, Lengths)
-    containers.choose_reader(path, dict.fromkeys((".npy", ".npz", ".h5", ".hdf5"), Path))
+    choose_reader(path, dict.fromkeys((".npy", ".npz", ".h5", ".hdf5"), Path))
     suffix = path.suffix.lower()
     if suffix in (".npy", ".npz"):
         if suffix == ".npz":
             arrays = read_npz(path, ("descriptors", "names"))
         else:
-            with containers.reading(path):
+            with reading(path):
                 arrays = {"descriptors": np.load(path, allow_pickle=False)}
         values, known = arrays.get("descriptors", np.zeros(0)), arrays.get("names")
         if known is None:  # in the order of the sorted names

@@ -175,9 +175,10 @@ def open_matches(
     """
     files = open_pairs(Path(path), (queries.names, database.names), verified)
     features = [side.features for side in (queries, database) if side.features is not None]
-    if len(features) != (2 if files.by_number and files.keypoints is None else 0):
-        expected = "features of both sides for hloc's matches of features, and otherwise none"
-        raise InputError(f"{path}: expected {expected}, got {len(features)}; give hloc's feats*.h5, or leave them out")
+    needed = 2 if files.by_number and files.keypoints is None else 0
+    if len(features) != needed:
+        expected, mend = ("of both sides", "give hloc's feats*.h5") if needed else ("of no side", "leave them out")
+        raise InputError(f"{path}: expected features {expected}, got {len(features)}; {mend}")
     return ImportedMatches(files, (queries, database), image_size, confidences)
 
 
@@ -246,6 +247,6 @@ def _confidences(where: str, confidence: Any, count: int) -> Float32[np.ndarray,
         return np.ones(count, np.float32)
     values = as_float32(f"{where}: confidences", np.asarray(confidence), "fiu")
     if values.shape != (count,) or (np.abs(values - 0.5) > 0.5 + _ROUNDING).any():
-        got = f"{[*values.shape]} up to {values.max(initial=0):g}; scale them, or leave them out (confidences=False)"
-        raise InputError(f"{where}: expected {count} confidences from 0 to 1, got {got}")
+        got, mend = f"{[*values.shape]} from {values.min(initial=1):g} to {values.max(initial=0):g}", "scale them"
+        raise InputError(f"{where}: expected {count} confidences from 0 to 1, got {got}; {mend}, or confidences=False")
     return np.clip(values, 0, 1)

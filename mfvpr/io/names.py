@@ -51,14 +51,17 @@ def match_names(path: Path, names: Sequence[str], foreign: Iterable[str]) -> lis
                 shared = min(len(parts), len(theirs))
                 if parts[-shared:] == theirs[-shared:]:  # one path is the end of the other
                     pairs[row, name] = theirs[:-shared], parts[:-shared]
-        is_known, prefix = prefix is not None, prefix or next(iter(pairs.values()), None)
+        is_known = prefix is not None
+        prefix = prefix or next(iter(pairs.values()), None)
         chosen = [pair for pair in sorted(pairs) if pairs[pair] == prefix]
         rows, images = Counter(row for row, _ in chosen), Counter(name for _, name in chosen)
         for row, name in sorted(pairs):
             has_other_prefix = pairs[row, name] != prefix and not is_exact and not (is_known and rows[row])
             if has_other_prefix or rows[row] > 1 or images[name] > 1:
                 expected = "one name for each image, and one prefix for all images of a folder"
-                got = f"{shorten(name)} for {shorten(names[row])} beside another name"
+                others = [each for each in sorted(pairs) if each != (row, name) and (row in each or name in each)]
+                both = [*(others or chosen)[:1], (row, name)]
+                got = " and ".join(f"{shorten(theirs)} for {shorten(names[ours])}" for ours, theirs in both)
                 raise InputError(f"{path}: expected {expected}, got {got}; {_FULL_NAMES}")
         for row, name in chosen:
             matched[row] = name

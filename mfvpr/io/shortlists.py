@@ -19,9 +19,7 @@ from mfvpr.utils.files import printable, require_replaceable, write_text
 
 PairLayout = Literal["hloc", "kapture", "preds"]
 _SEPARATORS = {"hloc": " \t\n\r", "kapture": ",\n\r", "preds": "\n\r"}  # characters that names must not contain
-
-
-Pair = tuple[str, str, float | None]  # names of a query and a database image, and the score if the line has one
+ScoredPair = tuple[str, str, float | None]  # names of a query and a database image, and the score if the line has one
 
 
 def read_shortlist(
@@ -172,7 +170,7 @@ def _from_npz(path: Path, num_queries: int, num_database: int) -> Iterator[tuple
         yield query, int(predictions[query, place]), scores[query, place]
 
 
-def _read_pairs(path: Path) -> list[Pair]:
+def _read_pairs(path: Path) -> list[ScoredPair]:
     """Read the pairs of a text file, in its order: commas or spaces are between the columns."""
     with reading(path, mend="expected a text file of image pairs"):
         text = path.read_text(encoding="utf-8-sig", errors="surrogateescape")
@@ -190,7 +188,7 @@ def _read_pairs(path: Path) -> list[Pair]:
     return pairs
 
 
-def _read_predictions(folder: Path) -> list[Pair]:
+def _read_predictions(folder: Path) -> list[ScoredPair]:
     """Read the pairs of a folder of predictions."""
     pairs, files = [], dict[str, Path]()
     for path in sorted(folder.glob("*.txt")):

@@ -95,10 +95,12 @@ def read_poses(path: Path | str, names: Sequence[str]) -> list[str]:
             raise InputError(f"{where}: expected {expected}, got {shorten(' '.join(words))!r}")
         if len(words) != _KITTI:
             stamp, words = parse_stamp(words[0], where), words[1:]
-            is_image = image_stamps is None or abs(stamp - image_stamps[row]) <= _LARGEST_GAP
-            if stamp <= before or not is_image:
-                expected = f"ascending timestamps, within 10 ms of images named by times such as {shorten(names[row])}"
-                raise InputError(f"{where}: expected {expected}, got {_seconds(stamp)} after {_seconds(before)}")
+            if stamp <= before:
+                got = f"{_seconds(stamp)} after {_seconds(before)}"
+                raise InputError(f"{where}: expected ascending timestamps, got {got}; sort the lines by time")
+            if image_stamps is not None and abs(stamp - image_stamps[row]) > _LARGEST_GAP:
+                expected = f"the time of {shorten(names[row])} within 10 ms"
+                raise InputError(f"{where}: expected {expected}, got {_seconds(stamp)}")
             before = stamp
         poses.append(" ".join(words))
     return poses

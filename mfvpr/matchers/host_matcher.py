@@ -13,6 +13,7 @@ from mfvpr.core.types import INDICES, Features, Matches, Shortlist, per_match
 from mfvpr.datasets.datasets import ImageFolder
 from mfvpr.datasets.image_reading import Interpolation, resize
 from mfvpr.features.feature_set import FeatureSet
+from mfvpr.io.containers import shorten
 from mfvpr.io.matches import numbered_matches, point_matches
 from mfvpr.matchers.batched_matching import Pair, join_candidates
 from mfvpr.matchers.match_set import QueryMatches
@@ -156,7 +157,8 @@ class _CalledPairs:
         try:
             values = [None if part is None else np.array(as_array(part)) for part in result]  # of a buffer, perhaps
         except Exception as error:  # of NumPy for ragged lists, of any library for tensors that are not dense
-            raise InputError(f"{where}: expected dense arrays, got others ({' '.join(str(error).split())})") from error
+            reason = shorten(" ".join(str(error).split()), 160)
+            raise InputError(f"{where}: expected dense arrays, got others ({reason})") from error
         confidence = values[2] if len(values) == 3 else None
         if self.numbered:
             return numbered_matches(where, values[0], values[1], confidence, first, second)

@@ -11,6 +11,7 @@ from jaxtyping import Float, Int, Num
 
 from mfvpr.core.types import Matches, per_match, per_pair
 from mfvpr.features.feature_set import few_capacities, pad_rows
+from mfvpr.utils.fingerprints import content_hash
 from mfvpr.utils.numerics import available_cpus, repeat_last, round_up
 from mfvpr.utils.runtime import ordered_map
 
@@ -96,6 +97,11 @@ class MatchSet:
                 values = [of_query[place] for of_query, (_, place) in zip(values, pairs, strict=True)]
             entries[name] = repeat_last(np.stack(values), len(mask))
         return Matches(**entries, mask=mask)
+
+    @cached_property
+    def fingerprint(self) -> str:
+        """Hash of all matches."""
+        return content_hash(self.counts, [content_hash(query) for query in self.matches])
 
     @cached_property
     def _ends(self) -> Int[np.ndarray, "queries candidates"]:
@@ -186,7 +192,8 @@ def batches(
 
 def queries_that_fit(match_set: MatchSet | Scales, num_settings: int) -> int:
     """Number of queries, at least 1, with matches, scores and rankings that fit into about BLOCK_BYTES."""
-    num_queries, num_candidates = (sets := scales(match_set))[0].counts.shape
+    sets = scales(match_set)
+    num_queries, num_candidates = sets[0].counts.shape
     padded = sum(slots(scale, settings=num_settings).sum(1) for scale in sets)
     of_query = 2 * BYTES_PER_SLOT * np.max(padded, initial=0) + (8 + 4 * len(sets)) * num_settings * num_candidates
     return max(1, min(num_queries, BLOCK_BYTES // max(int(of_query), 1)))

@@ -43,8 +43,10 @@ def comparison_table(comparison: Comparison) -> Table:
 
 def _by_set(protocol: EvaluationProtocol, hits: np.ndarray) -> dict[str, np.ndarray]:
     """Hits `[R]` of each data set, where several are reported on."""
-    ends = np.cumsum([*protocol.reported_sets.values()])
-    return dict(zip(protocol.reported_sets, np.split(hits, ends[:-1]), strict=False)) if len(ends) else {}
+    if not protocol.reported_sets:
+        return {}
+    ends = np.cumsum([*protocol.reported_sets.values()])[:-1]
+    return dict(zip(protocol.reported_sets, np.split(hits, ends), strict=True))
 
 
 def comparison_text(comparison: Comparison) -> str:

@@ -14,6 +14,7 @@ from matplotlib.axes import Axes
 from matplotlib.collections import LineCollection
 from matplotlib.image import AxesImage
 from matplotlib.patches import Rectangle
+from PIL import Image
 
 from mfvpr.core.histogram import HistogramOfShifts
 from mfvpr.core.types import Matches
@@ -269,10 +270,9 @@ def contact_sheet(path: Path, dataset: Dataset) -> None:
         for panel, (folder, row) in zip(axes[2 * number :], pair, strict=False):
             panel.set_title(_short(f"{folder.root.name}/{folder.names[row]}"), fontsize=7, parse_math=False)
             try:
-                image = folder.read(row)
-                scale = _SIDE / max(image.shape[:2])
-                size = max(1, round(image.shape[1] * scale)), max(1, round(image.shape[0] * scale))
-                panel.imshow(resize(image, size))
+                image = Image.fromarray(folder.read(row))
+                image.thumbnail((_SIDE, _SIDE))
+                panel.imshow(image)
             except InputError:
                 panel.text(0.5, 0.5, "cannot be read", ha="center")
     save_figure(figure, path, dpi=80)

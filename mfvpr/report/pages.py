@@ -13,7 +13,7 @@ from mfvpr.datasets.datasets import MEANS
 from mfvpr.datasets.ground_truth import middle, threshold_words
 from mfvpr.evaluation.confidence import PrecisionRecall
 from mfvpr.evaluation.rankings import RETRIEVAL
-from mfvpr.evaluation.statistics import Estimate, estimate
+from mfvpr.evaluation.statistics import Estimate, estimate, mcnemar, path_test
 from mfvpr.io.containers import reading
 from mfvpr.report.evaluations import sequence_folder
 from mfvpr.report.rendering import (
@@ -28,7 +28,6 @@ from mfvpr.report.rendering import (
     values_table,
     write_page,
 )
-from mfvpr.report.run_files import difference_cells
 from mfvpr.report.runs import LAST, file_names
 from mfvpr.report.tables import Table, format_estimate, format_interval, read_csv, read_table, table_of
 from mfvpr.utils.errors import InputError
@@ -217,15 +216,17 @@ def _recall_sections(runs: Mapping[str, Run], curves: Curves) -> list[Section]:
         if len(run.sequences) > 1 and len(runs) == 1:
             groups = {name: {part: run.recall(name, run.parts[part]) for part in run.parts} for name in curves}
     bars = bar_chart("intervals", "Recall at 1, with intervals", groups, axis="recall at 1, %")
-    words = "In %, correct at the middle tolerance; intervals are 95 % and know that neighbors along the path fail "
+    words = "In %, at the middle tolerance. The 95 % intervals are wider if neighboring queries fail together."
     recall = {"Recall of every system": table_of(rows, ("run", "system", "sequence"))}
     charts = [bars, *_tolerance_chart(curves), _depths_chart(curves)]
     precision = _precision_charts(curves, "score") + _precision_charts(curves, "confidence")
-    about = "AP is the average precision, R@100P the recall at 100 % precision, ECE the expected calibration error of "
+    about = (
+        "AP: average precision. R@100P: recall at 100 % precision. ECE: expected calibration error of the confidence."
+    )
     return [
-        Section("recall", "Recall", f"{words}together.", charts, recall),
+        Section("recall", "Recall", words, charts, recall),
         _pairs_section(curves),
-        Section("confidence", "Precision and recall", f"{about}confidence.", precision, tables),
+        Section("confidence", "Precision and recall", about, precision, tables),
     ]
 
 
@@ -273,11 +274,13 @@ def _pairs_section(curves: Curves) -> Section:
     """Tests of every two curves, query by query, and the pairs that cannot be compared."""
     rows, incomparable = [], []
     for (name, (run, system)), (other, (second, other_system)) in itertools.combinations(curves.items(), 2):
-        if reason := why_not(run, second):
+        if reason := _incomparable_reason(run, second):
             incomparable.append([name, other, reason])
             continue
-        only_first, only_second, *numbers = difference_cells(run.hits(system), second.hits(other_system))
-        rows.append([name, other, only_first, only_second, *(f"{float(cell):.2g}" for cell in numbers)])
+        hits = run.hits(system), second.hits(other_system)
+        test, path = mcnemar(*hits), path_test(*hits)
+        numbers = (f"{value:.2g}" for value in (test.p_value, *path))
+        rows.append([name, other, str(test.only_first), str(test.only_second), *numbers])
     words = (
         "How many queries only one of two predicts correctly, and how probable that is if neither is better, by "
         "McNemar's exact test, which takes queries for independent, and by a test along the path."
@@ -289,7 +292,7 @@ def _pairs_section(curves: Curves) -> Section:
     return Section("differences", "Differences", words, tables=tables)
 
 
-def why_not(first: Run, second: Run) -> str | None:
+def _incomparable_reason(first: Run, second: Run) -> str | None:
     """The reason that two runs with ground truth cannot be compared query by query; None = they can."""
     if first.common["data_fingerprint"] != second.common["data_fingerprint"]:
         return "other images"
@@ -304,12 +307,12 @@ def why_not(first: Run, second: Run) -> str | None:
 
 def _predictions_section(run: Run) -> Section:
     with reading(run.folder / LAST, mend=_EXPECTED):
-        images, predictions = pictures(run.folder), [*itertools.islice(run.predictions(), MOST_PREDICTIONS)]
+        images, predictions = pictures(run.folder), [*itertools.islice(run.predictions(), MOST_PREDICTIONS + 1)]
     words = "Query and top prediction with their heaviest matches, and the histogram of their shifts. An incorrect "
     words += "prediction has the correct image below it. The table has the queries without a picture, too."
-    if len(predictions) == MOST_PREDICTIONS:
+    if len(predictions) > MOST_PREDICTIONS:
         words += f" It has the first {MOST_PREDICTIONS}; the others are in the folder `predictions` of the run."
-    return Section("predictions", "Predictions", words, pictures=images, predictions=predictions)
+    return Section("predictions", "Predictions", words, pictures=images, predictions=predictions[:MOST_PREDICTIONS])
 
 
 def _settings_section(run: Run) -> Section:

@@ -179,9 +179,9 @@ def write_run_folder(folder: Path, report: EvaluationReport, description: RunDes
     write_confidences(folder / "confidence.json", fits, provenance)
 
 
-def _names(report: EvaluationReport, rows: np.ndarray) -> Any:
+def _names(database: Sequence[str], rows: np.ndarray) -> Any:
     """Names of database images, "" for row -1."""
-    return np.array([*report.ranked.dataset.database.names, ""], object)[rows]
+    return np.array([*database, ""], object)[rows]
 
 
 def _cells(correct: np.ndarray | None, number: int) -> list[int | str]:
@@ -209,7 +209,7 @@ def _write_sequence(folder: Path, report: EvaluationReport, place: int) -> None:
         places = np.argmax(matched.candidates.indices[queries] == predictions[queries, None], axis=1)
         shifts, intervals, sizes = dominant_shifts(report.histogram, matched.by_scale, queries, places)
         numbers = np.concatenate([shifts, intervals.transpose(0, 2, 1).reshape(-1, 4), sizes], axis=1)
-        columns = {"query": [names[query] for query in queries], "prediction": _names(report, predictions[queries])}
+        columns = {"query": [names[query] for query in queries], "prediction": _names(database, predictions[queries])}
         columns |= {name: [*map(format_number, column)] for name, column in zip(SHIFTS, numbers.T, strict=True)}
         _write_columns(folder / "shifts.csv", columns)
     if headline in report.probabilities:
@@ -233,7 +233,7 @@ def write_predictions(
     is_shown = (ranked.rows >= 0) & ~is_refused[:, None]
     is_shown[:, 0] |= is_refused
     query, rank = np.nonzero(is_shown)
-    images, is_refused = np.array([*database, ""], object)[ranked.rows[query, rank]], is_refused[query]
+    images, is_refused = _names(database, ranked.rows[query, rank]), is_refused[query]
     columns = {
         "query": [queries[row] for row in query.tolist()],
         "rank": (rank + 1).tolist(),
@@ -253,10 +253,11 @@ def _write_top_predictions(folder: Path, report: EvaluationReport, place: int) -
     """
     name, names = report.headline, report.sequences[place].images.names
     ranked, positives = report.ranked.systems[name][place], report.positives[place]
-    correct = None if positives is None else positives.contains(ranked.rows[:, :1])[:, 0]
+    database, is_correct = report.ranked.dataset.database.names, report.is_correct(name, place)
+    correct = None if is_correct is None else is_correct[:, 0]
     values = (report.reasons(name), *report.both_probabilities[name])
     reasons, *both = (report.by_sequence(value)[place] for value in values)
-    is_refused, images = np.array([reason is not None for reason in reasons], bool), _names(report, ranked.rows[:, 0])
+    is_refused, images = np.array([reason is not None for reason in reasons], bool), _names(database, ranked.rows[:, 0])
     outcomes = np.full(len(names), "") if correct is None else np.where(correct, "correct", "incorrect")
     # Rounding may move a confidence to another bin.
     confidences = [["" if np.isnan(p) else repr(float(p)) for p in column] for column in both]
@@ -278,13 +279,14 @@ def _write_top_predictions(folder: Path, report: EvaluationReport, place: int) -
 def _write_changes(folder: Path, report: EvaluationReport) -> None:
     """Write `changes.csv` with the queries whose first prediction a sequence changes, if the system has sequences."""
     scores, lines = report.ranked.system.final_scores.values(), []
+    database = report.ranked.dataset.database.names
     filtered = [score for score in scores if isinstance(score.step, DriveFilter)]
     for score, (place, sequence) in itertools.product(filtered, enumerate(report.sequences)):
         before, after = (report.ranked.systems[name][place].rows[:, 0] for name in (score.base, score.name))
-        positives, columns = report.positives[place], [sequence.images.names]
-        for rows in (before, after):
-            correct = None if positives is None else positives.contains(rows[:, None])[:, 0]
-            columns += [_names(report, rows), _cells(correct, len(rows))]
+        columns: list[Any] = [sequence.images.names]
+        for name, rows in ((score.base, before), (score.name, after)):
+            correct = report.is_correct(name, place)
+            columns += [_names(database, rows), _cells(None if correct is None else correct[:, 0], len(rows))]
         changed = itertools.compress(zip(*columns, strict=True), before != after)
         lines += [[score.name, sequence.name, *line] for line in changed]
     if filtered:
@@ -323,14 +325,8 @@ def write_gains(folder: Path, report: EvaluationReport) -> None:
     path, lines = np.argsort(places, kind="stable"), []
     hits = {name: report.hits(name)[path] for name in systems}
     for first, second in itertools.combinations(systems, 2):
-        lines.append([first, second, *difference_cells(hits[first], hits[second])])
+        test, path_p = mcnemar(hits[first], hits[second]), path_test(hits[first], hits[second])
+        numbers = map(format_number, (test.p_value, *path_p))
+        lines.append([first, second, test.only_first, test.only_second, *numbers])
     header = ["system", "other", "only_system", "only_other", "mcnemar_p", "design_effect", "path_p"]
     write_csv(folder / "differences.csv", header, lines)
-
-
-def difference_cells(hits: Bool[np.ndarray, " queries"], others: Bool[np.ndarray, " queries"]) -> list[str]:
-    """Tests of hits of two systems along a path: queries that only one of them predicts correctly, McNemar's p,
-    design effect and p along the path.
-    """
-    only_first, only_second, p_value = mcnemar(hits, others)
-    return [str(only_first), str(only_second), *map(format_number, (p_value, *path_test(hits, others)))]

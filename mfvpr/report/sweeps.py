@@ -96,7 +96,7 @@ class Sweep:
         InputError if the folder is neither new nor empty, nor one of a sweep.
         """
         folder, last = Path(folder), Path(folder) / runs.LAST
-        has_sweep = (last.exists() and b'"axes"' in last.read_bytes()) or (folder / "blocks").exists()
+        has_sweep = (last.exists() and b'"axes"' in last.read_bytes()) or (folder / "rankings").exists()
         if folder.exists() and not has_sweep and (folder.is_file() or any(folder.iterdir())):
             raise InputError(f"{folder}: expected a new or empty folder, or one of a sweep; name another")
         shutil.rmtree(folder / "figures", ignore_errors=True)
@@ -190,7 +190,9 @@ def sweep_summary(outcome: Outcome, heading: str) -> str:
 
 def sweep_figures(outcome: Outcome) -> list[Figure]:
     """Heat maps of every pair of axes with several values; none of a search that tried no complete grid."""
-    names = [name for name, axis in outcome.axes.values.items() if len(axis) > 1 and outcome.is_grid]
+    if not outcome.is_grid:
+        return []
+    names = [name for name, axis in outcome.axes.values.items() if len(axis) > 1]
     pairs = list(itertools.combinations(names, 2)) or [("", name) for name in names]
     files = file_names([" + ".join(filter(None, pair)) for pair in pairs]).values()
     figures = []

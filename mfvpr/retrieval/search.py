@@ -41,6 +41,9 @@ class ExactSearch:
         self, queries: Queries, database: Database, num_candidates: int, *, excluded: Positives | None = None
     ) -> Shortlist:
         """Candidates of queries in the database, NumPy; images in `excluded` are no candidates of their queries."""
+        if excluded is not None and (len(excluded), excluded.num_database) != (len(queries), len(database)):
+            expected, got = f"{len(queries)} queries and {len(database)} images", len(excluded)
+            raise InputError(f"excluded: expected rows of {expected}, got {got} and {excluded.num_database}")
         device = device_of(())
         num_rows = ROWS
         if device.platform != "cpu":  # as many as fit, since every part costs a wait

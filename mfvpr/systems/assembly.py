@@ -1,4 +1,4 @@
-"""Systems from settings: the choices of each group with their settings, and what is made of checked settings.
+"""Systems from settings: the choices of each group with their settings, and the objects that are built from them.
 
 A choice that is named in a file is looked up here; nothing else can be made.
 """

@@ -145,8 +145,9 @@ def setting(default: Any, rule: Rule, note: str = "", *, static: bool = False, r
     """
     plain = None if default == more.get("none") else [*default] if isinstance(default, tuple) else default
     metadata = {_KEY: Setting(plain, rule, note, **more), "static": static, "recipe": recipe}
-    made: Any = {"default_factory" if callable(default) else "default": default}
-    return field(**made, metadata=metadata)
+    if callable(default):
+        return field(default_factory=default, metadata=metadata)
+    return field(default=default, metadata=metadata)
 
 
 def settings_of(owner: type) -> dict[str, Any]:

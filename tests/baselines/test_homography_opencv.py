@@ -1,6 +1,7 @@
 """Scorers on the host: OpenCV's homography beside plain calls of OpenCV, and scorers of users that break the rules."""
 
-from dataclasses import replace
+from dataclasses import field, replace
+from typing import Any
 
 import cv2
 import jax
@@ -94,19 +95,15 @@ def test_few_matches_and_broken_ones():
 
 @mfvpr.value
 class Host:
-    """Scores by `answer` from the masks."""
+    """Scores pairs by a function of their masks."""
 
-    shift: float = 0.0
+    answer: Any = field(metadata={"static": True})
 
     def __call__(self, matches):
         return np.float32(0)
 
     def score_pairs(self, matches):
-        return answer(np.asarray(matches.mask))
-
-
-def answer(masks):
-    return masks.sum(axis=1)
+        return self.answer(np.asarray(matches.mask))
 
 
 @pytest.mark.parametrize(
@@ -117,15 +114,14 @@ def answer(masks):
         (lambda masks: masks.sum(axis=1) * 1j, "real numbers.* got complex"),
     ],
 )
-def test_a_real_number_for_each_pair_is_expected(monkeypatch, wrong, words):
-    monkeypatch.setitem(globals(), "answer", wrong)
+def test_a_real_number_for_each_pair_is_expected(wrong, words):
     for score in (
         lambda scorer: score_candidates(scorer, BATCH),
         lambda scorer: score_grid(scorer, BATCH, max_distance=[9.0]),
         lambda scorer: sweeps.rank_settings(scorer, [{"max_distance": 9.0}], MATCHES, CANDIDATES),
     ):
         with pytest.raises(InputError, match=rf"Host\.score_pairs: .*{words}"):
-            score(Host())
+            score(Host(wrong))
 
 
 def test_a_class_that_is_no_value_raises():

@@ -214,7 +214,7 @@ def test_the_claim_of_a_killed_run_is_free(tmp_path):
 
 
 def test_a_full_disk_costs_no_table(root, evaluated, tmp_path, call, monkeypatch):
-    """While results are written, files cannot grow beyond so many bytes, as on a full disk."""
+    """The table is printed if files cannot grow beyond 2,000 bytes, as on a full disk."""
     before, write_results = resource.getrlimit(resource.RLIMIT_FSIZE), jobs.write_results
 
     def limited(*arguments, **named):
@@ -230,6 +230,17 @@ def test_a_full_disk_costs_no_table(root, evaluated, tmp_path, call, monkeypatch
     assert "\nhistogram + retrieval " in stdout
     assert stderr.splitlines()[-1].startswith(f"error: {tmp_path}/out: the results cannot be written (File too large)")
     assert list(tmp_path.iterdir()) == []
+
+
+def test_a_figure_that_cannot_be_drawn_costs_a_warning(root, evaluated, tmp_path, monkeypatch, succeed):
+    def fail(*_, **__):
+        raise OSError("full")
+
+    monkeypatch.setattr("mfvpr.report.figures.histogram_figure", fail)
+    _, stderr = succeed("evaluate", *small(root), *LINES, "figures=2", f"out={tmp_path}/out")
+    assert stderr.count("not drawn (full)") == 2
+    assert (tmp_path / "out/predictions.csv").read_bytes() == (evaluated / "predictions.csv").read_bytes()
+    assert "/queries in " in (tmp_path / "out/report.html").read_text("utf-8").partition("</title>")[0]
 
 
 def test_ctrl_c_while_figures_are_drawn_keeps_the_tables(root, evaluated, tmp_path, monkeypatch, call):

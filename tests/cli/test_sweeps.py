@@ -96,7 +96,7 @@ def test_choosing_for_a_sequence_sees_nothing_of_the_reported_half(dataset):
 
 def test_files_are_whole_and_the_same_call_computes_nothing_again(sweep, swept, monkeypatch, tmp_path):
     out, result = swept
-    names = {"blocks", "figures", "results.json", "summary.txt", "table.csv", "table.md", "table.tex"}
+    names = {"figures", "rankings", "results.json", "summary.txt", "table.csv", "table.md", "table.tex"}
     assert {path.name for path in out.iterdir()} == names
     assert (out / "table.csv").read_text() == result.table().csv()
     assert json.loads((out / "results.json").read_text())["axes"] == AXES

@@ -123,9 +123,12 @@ def test_nordland_pairs_frames_of_one_number(tmp_path):
     assert (turned.database.root.name, turned.queries.root.name) == ("winter", "fall")
     check_error("nordland_27592", tmp_path, "expected two of fall, spring", seasons=("may", "fall"))
     (tmp_path / "winter/images-00008.png").rename(tmp_path / "winter/images-00009.png")
-    check_error("nordland_27592", tmp_path, "first images-00008 alone")
+    check_error("nordland_27592", tmp_path, "first that differ are images-00008 and images-00009")
     (tmp_path / "winter/images-00009.png").unlink()
     check_error("nordland_27592", tmp_path, "got 2 and 3 frames")
+    for name in ("images-00008.png", "images-00008.jpg"):
+        (tmp_path / "winter" / name).write_bytes(b"")
+    check_error("nordland_27592", tmp_path, "got 4 and 3 frames")
 
 
 def test_nordland_takes_the_frames_of_patch_netvlads_lists(tmp_path):
@@ -327,7 +330,7 @@ def test_faults_of_msls(msls):
     for table, before, after, words in (
         ("subtask_index", "q3", "q4", "expected equal keys"),
         ("postprocessed", "q3", "q2", "expected equal keys"),
-        ("postprocessed", "easting", "east", "and pano, all (True"),
+        ("postprocessed", "easting", "east", "expected pano and all (True"),
         ("postprocessed", "5000000.0", "nan", "expected positions"),
     ):
         path = msls / f"train_val/sf/query/{table}.csv"

@@ -109,6 +109,8 @@ def test_sweeps_fuse_scales_over_the_ranked_candidates(two_scales, tmp_path):
         listed = replace(candidates, mask=seen)
         for rows, setting in zip(by_setting, settings, strict=True):
             scores = stages.score({"sum": mfvpr.AggregatedScore(mean=setting["mean"])}, scales, listed)["sum"]
-            order = rankings.rank_shortlist(listed, rankings.fuse_shortlist(listed, scores, setting["c"]))
+            order = rankings.rank_shortlist(
+                listed, np.asarray(rankings.fuse(listed.scores, scores, listed.mask, setting["c"]))
+            )
             indices = np.where(seen, candidates.indices, -1)
             np.testing.assert_array_equal(rows, np.take_along_axis(indices, order, axis=1))

@@ -133,7 +133,9 @@ def test_other_files_are_refused_in_one_line(content, tmp_path):
 def test_halves_of_drives_there_and_back_share_no_place():
     """Two drives of 20 places, the second backward; a query shows the places beside it as well."""
     rows = [range(max(0, place - 1), min(20, place + 2)) for place in (*range(20), *reversed(range(20)))]
-    places = [Positives.from_rows(list(map(list, drive)), 20) for drive in (rows[:20], rows[20:])]
+    rows[20:20], nowhere = [[], []], {20, 21, 42, 43}  # two queries at the end of each drive have no place
+    rows += [[], []]
+    places = [Positives.from_rows(list(map(list, drive)), 20) for drive in (rows[:22], rows[22:])]
     sequences = [SimpleNamespace(truth=SimpleNamespace(shows_place=lambda _, drive=drive: drive, unit="frames"))
                  for drive in places]  # fmt: skip
     ranked: Any = SimpleNamespace(dataset=SimpleNamespace(sequences=sequences))
@@ -143,7 +145,8 @@ def test_halves_of_drives_there_and_back_share_no_place():
         assert not places[0] & places[1]
         assert min(map(len, places)) >= 9
         reported.extend(half.report)
-    assert sorted(reported) == list(range(40))
+        assert sum(query in nowhere for query in half.report) == 2
+    assert sorted(reported) == list(range(44))
 
 
 def made_up(seed=0, queries=40):

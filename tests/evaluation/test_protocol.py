@@ -47,7 +47,7 @@ def test_each_half_chooses_by_its_own_view_and_is_reported_on_by_the_other(rows,
         [[recall_of(ranking, inner[number], tolerance) for tolerance in TOLERANCES] for ranking in rows[view]]
         for view, number in enumerate(numbers, start=1)
     ]
-    np.testing.assert_allclose(protocol.tuning(rows), expected)
+    np.testing.assert_allclose(protocol.tuning(rows[: 1 + len(numbers)]), expected)
     chosen = [3, 1][: len(numbers)]
     parts = [
         [[bool(recall_of(rows[0][setting], [query], tolerance)) for query in blocks[1 - number]]
@@ -65,6 +65,14 @@ def test_choosing_sees_no_candidate_of_a_reported_place():
     np.testing.assert_array_equal(all_candidates, indices >= 0)
     np.testing.assert_array_equal(first, (indices >= 0) & (indices < QUERIES // 2 - TOLERANCES[-1]))
     np.testing.assert_array_equal(second, indices >= QUERIES // 2 + TOLERANCES[-1])
+
+
+def test_fingerprints_tell_ground_truths_apart():
+    shifted = FrameTruth(tuple(((row + 1) % QUERIES,) for row in range(QUERIES)), QUERIES)
+    protocol = evaluation_protocol(TRUTH, TOLERANCES)
+    others = evaluation_protocol(TRUTH, (0, 1, 2)), evaluation_protocol(shifted, TOLERANCES)
+    assert protocol.fingerprint not in {other.fingerprint for other in others}
+    assert evaluation_protocol(TRUTH, TOLERANCES, "both").fingerprint == protocol.fingerprint
 
 
 def test_thresholds_ascend_and_the_middle_one_decides():

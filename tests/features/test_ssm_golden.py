@@ -95,12 +95,13 @@ def image(vectors):
 
 @pytest.mark.parametrize("case", [*MAPS, *IMAGES])
 def test_scores_are_equal_as_whole_numbers(golden, case):
-    """For the program's own matches, with its padding on a CPU."""
+    """For the program's own matches, with its padding on a CPU, and on a GPU."""
     index = golden[f"{case}/index"]
     side = index.shape[-1]
     for place in np.ndindex(index.shape[:2]):
         pair = cells(index[place], side)
         assert int(score(GridAnchors(side), pair)) == golden[f"{case}/scores"][place]
+        assert int(score(GridAnchors(side, outside="zero"), pair)) == golden[f"{case}/zero_scores"][place]
 
 
 @pytest.mark.parametrize("case", [*MAPS, *IMAGES])

@@ -58,7 +58,7 @@ def test_what_is_written_is_read(tmp_path):
         ([*TUM[:2], "13 nan 2 3 0 0 0 1"], "line 3: expected .* finite numbers .*got '13 nan"),
         ([*TUM[:2], "13 1_0 2 3 0 0 0 1"], "line 3: expected .* finite numbers .*got '13 1_0"),
         ([*KITTI[:2], KITTI[2].replace("9", "1e999")], "line 3: expected .* finite numbers .*1e999"),
-        ([TUM[0], TUM[2], TUM[1]], "line 3: expected ascending timestamps, .* got 12.750000000 after 13.000000000"),
+        ([TUM[0], TUM[2], TUM[1]], "line 3: expected ascending timestamps, got 12.750000000 after 13.000000000"),
         ([*TUM[:2], "-1 1 2 3 0 0 0 1"], "line 3: expected a time in s, .* got '-1'"),
     ],
 )
@@ -70,7 +70,7 @@ def test_other_files_are_one_line(write, lines, message):
 def test_poses_belong_to_the_times_of_the_images(write):
     names = ["rgb/12.504.png", "rgb/12.745.png", "rgb/13.009.png"]
     assert len(read_poses(write(TUM), names)) == 3
-    with one_line_error(r"line 3: expected .* within 10 ms .* rgb/13\.011\.png, got 13\.000000000"):
+    with one_line_error(r"line 3: expected the time of rgb/13\.011\.png within 10 ms, got 13\.000000000"):
         read_poses(write(TUM), [*names[:2], "rgb/13.011.png"])
     assert len(read_poses(write(KITTI), names)) == 3
 

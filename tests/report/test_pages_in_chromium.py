@@ -97,10 +97,9 @@ def test_tables_are_sorted_by_click_and_by_key(tab):
     page.get_by_role("button", name="first correct rank").press("Space")
     assert header.get_attribute("aria-sort") is None
     assert cells(page, 6) == ["1"] * 8 + ["2", ""]  # numbers, and what is empty behind them
-    page.get_by_role("button", name="McNemar p").click()
-    values = [float(cell) for cell in cells(page, 5, "Every two of the same queries")]
-    assert len(values) == 3
-    assert values == sorted(values)
+    for _ in range(2):
+        page.get_by_role("button", name="McNemar p").click()
+    assert cells(page, 5, "Every two of the same queries") == ["0.62", "0.51", "0.062"]
 
 
 def test_answers_are_filtered_by_click_and_by_key(tab):

@@ -2,7 +2,7 @@
 
 import os
 import tempfile
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor, as_completed
 from dataclasses import dataclass
 from pathlib import Path
@@ -23,13 +23,13 @@ from mfvpr.datasets.streets.camera import (
 from mfvpr.datasets.streets.scene import Scene, build_scene, traffic
 from mfvpr.datasets.streets.sheets import WEATHERS, Floats, Image, Panel, Prop, Rng, Weather
 from mfvpr.utils.numerics import available_cpus
+from mfvpr.utils.runtime import Track, no_progress
 
 VERSION = 1  # of the images: raise it when they change, so that old caches are not used for new ones
 OVERSAMPLING = 1.5  # size of the canvas per size of the image, against jagged edges
 SIGHT = 100.0  # panels farther away are not drawn, meters
 CONDITIONS = ("dawn", "dusk", "night", "night-rain", "winter", "rain", "snow")  # those of RobotCar Seasons
 TRUTH = "ground_truth.csv"
-Progress = Callable[[int, int], None]
 
 
 @dataclass(frozen=True)
@@ -53,7 +53,7 @@ def draw_streets(
     seed: int = 0,
     num_frames: int = 100,
     image_size: tuple[int, int] = (448, 336),
-    progress: Progress | None = None,
+    progress: Track = no_progress,
 ) -> None:
     """Draw the synthetic street into `folder`.
 
@@ -71,7 +71,7 @@ def draw_streets(
         seed: of the street, its cars and the drives.
         num_frames: number of places, 1.75 m apart; there are twice as many images, with `seasons` eight times.
         image_size: (width, height) in px.
-        progress: `progress(done, total)` is called in the caller's thread after every image.
+        progress: over the images, in the caller's thread.
     """
     folder = Path(folder)
     database, queries = plan_drives(seed, num_frames, image_size)
@@ -93,7 +93,7 @@ def streets_folder(
     seed: int = 0,
     num_frames: int = 100,
     image_size: tuple[int, int] = (448, 336),
-    progress: Progress | None = None,
+    progress: Track = no_progress,
 ) -> Path:
     """The folder of the synthetic street inside `cache`, drawn if it is missing; options as in `draw_streets`.
 
@@ -116,7 +116,7 @@ def streets_folder(
     return folder
 
 
-def draw_drives(drives: Sequence[Drive], seed: int, length: float, progress: Progress | None) -> None:
+def draw_drives(drives: Sequence[Drive], seed: int, length: float, progress: Track = no_progress) -> None:
     """Draw the images of several drives, the database first, down the first `length` meters of one street."""
     drives[0].folder.parent.mkdir(parents=True)
     scene = build_scene(seed, length + SIGHT)
@@ -133,10 +133,8 @@ def draw_drives(drives: Sequence[Drive], seed: int, length: float, progress: Pro
     pool = ThreadPoolExecutor(available_cpus())  # more would only wait for each other
     try:
         futures = [pool.submit(draw_frame, scene, drive, row) for drive, row in shots]
-        for done, future in enumerate(as_completed(futures), start=1):
+        for future in progress(as_completed(futures), len(shots)):
             future.result()
-            if progress is not None:
-                progress(done, len(shots))
     finally:
         pool.shutdown(cancel_futures=True)
 
@@ -228,14 +226,15 @@ def expose(image: Image, weather: Weather, rng: Rng) -> Image:
     if defocus:
         seen = cv2.GaussianBlur(seen, (0, 0), defocus)
     height, width = seen.shape[:2]
-    fallen = np.zeros((height, width), np.uint8)
     if weather.flakes:
+        fallen = np.zeros((height, width), np.uint8)
         count = int(rng.uniform(0.5, 1.5) * weather.flakes)
         for x, y, radius in rng.uniform((0, 0, width / 1100), (width, height, width / 240), (count, 3)):
             center, gray = (round(x * 16), round(y * 16)), int(rng.integers(70, 180))
             cv2.circle(fallen, center, round(radius * 16), gray, -1, cv2.LINE_AA, 4)
         seen = seen + cv2.GaussianBlur(fallen, (0, 0), 0.8).astype(np.float32)[..., None] / 255 * (245 - seen)
     if weather.streaks:  # all blown to the same side
+        fallen = np.zeros((height, width), np.uint8)
         count, slant = int(rng.uniform(0.5, 1.5) * weather.streaks), rng.uniform(-0.3, 0.3)
         for x, y, length in rng.uniform((0, 0, width / 60), (width, height, width / 14), (count, 3)):
             start, end = (round(x * 16), round(y * 16)), (round((x + slant * length) * 16), round((y + length) * 16))

@@ -11,7 +11,19 @@ import cv2
 import numpy as np
 
 from mfvpr.datasets.streets.camera import LANE, Camera, Facade
-from mfvpr.datasets.streets.sheets import WEATHERS, Color, Panel, Prop, Rng, Sheet, Texture, Weather, blotches, tone
+from mfvpr.datasets.streets.sheets import (
+    DARK,
+    WEATHERS,
+    Color,
+    Panel,
+    Prop,
+    Rng,
+    Sheet,
+    Texture,
+    Weather,
+    blotches,
+    tone,
+)
 
 
 def colors(text: str) -> tuple[Color, ...]:
@@ -242,7 +254,7 @@ def draw_window(sheet: Sheet, rng: Rng, x: float, y: float, motif: Motif, trim: 
     """One window with its middle at x and its upper edge at y; one in four is lit at night."""
     w, h = motif.width, motif.height
     left = x - w / 2
-    glow = tone(WARM, rng.uniform(0.6, 1.0)) if rng.random() < 0.25 else (0, 0, 0)
+    glow = tone(WARM, rng.uniform(0.6, 1.0)) if rng.random() < 0.25 else DARK
     if motif.ornament == "arch":
         sheet.ellipse(x, y, w / 2 + 0.1, 0.45, trim)
         sheet.ellipse(x, y, w / 2, 0.35, GLASS, glow)

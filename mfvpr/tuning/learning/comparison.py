@@ -104,8 +104,7 @@ class HalfComparison:
         for name, hand_set in by_hand.items():
             yield self.evaluate(name, hand_set, {})
             yield self.evaluate(f"{name} + retrieval", hand_set, {FUSION: options.c})
-        for name, fused in (("grid search", False), ("grid search + retrieval", True)):
-            setting, values = self.search(name, fused=fused)
+        for name, setting, values in self.search():
             yield self.evaluate(name, scorer, setting, values)
         for learned_weight, fused in itertools.product((False, True), repeat=2):
             name = ("match weights" if learned_weight else "gradient") + " + retrieval" * fused
@@ -128,25 +127,31 @@ class HalfComparison:
         [first] = self.first_rows(name, scorer, [setting], queries, self.split.candidates.mask)
         return Row(self.split.name, name, self.split.protocol.hits(first, queries), values or {}, fitted)
 
-    def search(self, name: str, *, fused: bool) -> tuple[Setting, Mapping[str, Any]]:
-        """The best setting of the grid on the half to choose on: as the sweep takes it, and as plain values."""
-        axes, queries, protocol = self.axes, self.split.half.tune, self.split.protocol
-        axes = axes if fused else Axes(axes.scorer, {k: v for k, v in axes.values.items() if k != FUSION})
-        settings = [dict(axes.setting(plain)) for plain in axes.grid()]
-        balanced_c = self.split.balance(self.split.score_deviation(axes.scorer))  # in units of the scores
-        for setting in settings if fused else ():
+    def search(self) -> Iterator[tuple[str, Setting, Mapping[str, Any]]]:
+        """The best settings of the grid on the half to choose on, without and with retrieval.
+
+        Each has a name, its values as a sweep takes them, and its plain values.
+        """
+        queries, protocol, scorer = self.split.half.tune, self.split.protocol, self.axes.scorer
+        balanced_c = self.split.balance(self.split.score_deviation(scorer))  # in units of the scores
+        alone = Axes(scorer, {name: axis for name, axis in self.axes.values.items() if name != FUSION})
+        settings, fused = ([dict(axes.setting(plain)) for plain in axes.grid()] for axes in (alone, self.axes))
+        for setting in fused:
             c = setting.get(FUSION)
             setting[FUSION] = self.options.c if FUSION not in setting else None if c is None else c * balanced_c
-        rows = self.first_rows(name, axes.scorer, settings, queries, self.split.seen)
-        best = best_setting(protocol.hits(rows, queries)[protocol.main].mean(axis=-1), axes.values)
-        return settings[best], axes.grid()[best]
+        rows = self.first_rows("grid search", scorer, settings + fused, queries, self.split.seen)
+        recall = protocol.hits(rows, queries)[protocol.main].mean(axis=-1)
+        best = best_setting(recall[: len(settings)], alone.values)
+        yield "grid search", settings[best], alone.grid()[best]
+        best = best_setting(recall[len(settings) :], self.axes.values)
+        yield "grid search + retrieval", fused[best], self.axes.grid()[best]
 
     def first_rows(
         self, name: str, scorer: Scorer, settings: Sequence[Setting], queries: np.ndarray, seen: np.ndarray
     ) -> np.ndarray:
         """First rows `[S, q, 1]` of the rankings of the seen candidates by every setting."""
-        runtime, label = self.runtime if len(settings) > 1 else DEFAULT_RUNTIME, f"{self.split.name}: {name}"
-        options = SweepOptions((1,), self.options.ties, runtime=runtime, label=label)
+        runtime = self.runtime if len(settings) > 1 else Runtime(self.runtime.devices)  # silent
+        options = SweepOptions(ks=(1,), ties=self.options.ties, runtime=runtime, label=f"{self.split.name}: {name}")
         return rank_settings(scorer, settings, *self.split.part(queries), views=[seen[queries]], options=options)[0]
 
     def learn(self, name: str, model: Model) -> Fit:

@@ -81,7 +81,7 @@ class TrainingSplit:
 
     def score_deviation(self, scorer: Scorer) -> float:
         """Standard deviation of the scores that learning may use; 1 if all are equal."""
-        scores = score({"it": scorer}, *self.part(self.train))["it"]
+        scores = score({"scorer": scorer}, *self.part(self.train))["scorer"]
         return float(np.std(scores[self.seen[self.train]])) or 1.0
 
     def balance(self, deviation: float) -> float:

@@ -222,8 +222,9 @@ def _manager(folder: Path) -> Iterator[ocp.CheckpointManager]:
         save_root_metadata=False,
     )
     try:
-        with warnings.catch_warnings(action="ignore"), ocp.CheckpointManager(folder.absolute(), options=options) as it:
-            yield it
+        manager = ocp.CheckpointManager(folder.absolute(), options=options)
+        with warnings.catch_warnings(action="ignore"), manager:
+            yield manager
     finally:
         logger.setLevel(level)
 

@@ -7,7 +7,6 @@ setting are kept in a file, and only settings that are missing are ranked.
 
 import itertools
 import math
-import shutil
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
@@ -26,7 +25,7 @@ from mfvpr.datasets.datasets import Dataset
 from mfvpr.datasets.positives import Positives
 from mfvpr.evaluation.drives import DriveFilter
 from mfvpr.evaluation.protocol import EvaluationProtocol, Half
-from mfvpr.evaluation.rankings import Ranked, RetrievalScore, Scores, Ties, fuse_shortlist
+from mfvpr.evaluation.rankings import Ranked, RetrievalScore, Scores, Ties, fuse, retrieval_scores
 from mfvpr.evaluation.stages import PaddedBatch, all_batches, fuse_all, require_finite, run_batches
 from mfvpr.matchers.match_set import MatchSet, Scales, partition, queries_that_fit, scales
 from mfvpr.storage.cache_files import CacheFiles
@@ -46,8 +45,7 @@ SETTINGS_PER_BLOCK = 64
 class DriveRanking:
     """A drive filter for the queries of a sweep, and what it needs of their data set.
 
-    `halves` are those that the views after the first are of: of a half, only the queries to choose on are ranked, among
-    the rows that choosing may see.
+    View 0 ranks all queries. View i + 1 ranks the queries to choose on of `halves[i]`, among its allowed rows.
     """
 
     drive_filter: DriveFilter
@@ -109,9 +107,9 @@ def rank_settings(
 
     Args:
         scorer: its other parameters stay.
-        settings: values by name, the same names in each: fields of the scorer (numbers are batch axes; each value of a
-            static field has its own program), `weight` (a Weight), `max_distance` of matches, and `c` of the fusion
-            with retrieval (None = balanced). Without `c` the score alone ranks.
+        settings: values by name, the same names in each but for `c`: fields of the scorer (numbers are batch axes; each
+            value of a static field has its own program), `weight` (a Weight), `max_distance` of matches, and `c` of the
+            fusion with retrieval (None = balanced). Without `c` the score alone ranks.
         match_set: matches of queries with their candidates; several scales are scored one by one and fused over the
             candidates that are ranked.
         candidates: their shortlist.
@@ -127,13 +125,13 @@ def rank_settings(
     size = num_queries if options.sequence else options.queries_per_block or queries_that_fit(match_set, at_once)
     parts = [range(num_queries)[start : start + size] for start in range(0, num_queries, max(1, size))]
     rows = np.full((len(settings), len(views), num_queries, max(options.ks)), -1, np.int32)
-    files, missing = _files(scorer, settings, match_set, candidates, views, options), list[int]()
-    for number, setting in enumerate(settings):
-        kept = None if files is None else files.get(fingerprint(recipe_of(setting)))
-        if kept is None:
-            missing.append(number)
-        else:
-            rows[number] = kept
+    files, is_ranked = _files(scorer, settings, match_set, candidates, views, options), np.zeros(len(settings), bool)
+    keys = [] if files is None else [fingerprint(recipe_of(setting)) for setting in settings]
+    for number, key in enumerate(keys):
+        if (stored := files and files.get(key)) is not None:
+            rows[number], is_ranked[number] = stored, True
+    missing = np.flatnonzero(~is_ranked).tolist()
+    by_retrieval = retrieval_scores(candidates, options.retrieval_score)
 
     # Settings that differ in c alone share their scores.
     names = [name for name in settings[0] if name != FUSION]
@@ -158,21 +156,20 @@ def rank_settings(
                 seen = Shortlist(candidates.indices[part], candidates.scores[part], mask[part])
                 for row, of_setting in zip(of_block, fuse_all(match_set, scores, seen.mask), strict=True):
                     for number in by_score[row]:
-                        first = _first_rows(seen, of_setting, settings[number], view, options)
+                        first = _first_rows(seen, of_setting, by_retrieval[part], settings[number], view, options)
                         rows[number, view, part, : first.shape[1]] = first
         if files is not None:
-            ranked = [number for row in of_block for number in by_score[row]]
-            files.update({fingerprint(recipe_of(settings[number])): rows[number] for number in ranked})
+            files.update({keys[number]: rows[number] for row in of_block for number in by_score[row]})
     next(ticks, None)  # ends the progress
     return np.moveaxis(rows, 1, 0)
 
 
 def _first_rows(
-    candidates: Shortlist, scores: Scores, setting: Setting, view: int, options: SweepOptions
+    candidates: Shortlist, scores: Scores, by_retrieval: Scores, setting: Setting, view: int, options: SweepOptions
 ) -> Int[np.ndarray, "queries _"]:
     """Database rows by the scores of a setting, fused with its c, among the candidates of a view."""
     if FUSION in setting:
-        scores = fuse_shortlist(candidates, scores, setting[FUSION], retrieval_score=options.retrieval_score)
+        scores = np.asarray(fuse(by_retrieval, scores, candidates.mask, setting[FUSION]))
     ranked = Ranked.of(candidates, scores, options.ties)
     rows = ranked.rows if options.sequence is None else options.sequence.rows(ranked, view)
     return rows[:, : max(options.ks)]
@@ -216,18 +213,24 @@ def _files(
         options.runtime.log(f"{options.label}: no results are kept in {options.folder}, as there is no recipe: {error}")
         return None
     fusion = f"scales of {match_set.weights}" if isinstance(match_set, Scales) else "one scale"
-    matches = [[content_hash(query) for query in scale.matches] for scale in scales(match_set)]
-    recipe["data"] = content_hash(fusion, matches, [scale.counts for scale in scales(match_set)], candidates, views)
+    matches = [scale.fingerprint for scale in scales(match_set)]
+    recipe["data"] = content_hash(fusion, matches, candidates, views)
     pack, unpack = lambda rows: {"rows": rows}, itemgetter("rows")
     return CacheFiles(options.folder, "sweep", recipe, pack, unpack, compress=True)
 
 
 def forget_rankings(
-    scorer: Any, match_set: MatchSet | Scales, candidates: Shortlist, views: Views, options: SweepOptions
+    scorer: Any,
+    settings: Sequence[Setting],
+    match_set: MatchSet | Scales,
+    candidates: Shortlist,
+    views: Views,
+    options: SweepOptions,
 ) -> None:
-    """Remove the rows that a sweep kept in its folder: when it is finished, changed code may rank otherwise."""
-    if (files := _files(scorer, [], match_set, candidates, views, options)) is not None:
-        shutil.rmtree(files.folder, ignore_errors=True)
+    """Remove the rows of a finished sweep from its folder, as changed code may rank otherwise."""
+    if (files := _files(scorer, settings, match_set, candidates, views, options)) is not None:
+        for setting in settings:
+            files.path(fingerprint(recipe_of(setting))).unlink(missing_ok=True)
 
 
 def grid(axes: Mapping[str, Sequence[Any]]) -> list[dict[str, Any]]:

@@ -78,9 +78,9 @@ class Axes:
             values[name] = list(map(_plain, axis)) if is_list else []
             if len({*values[name]}) < max(1, len(values[name])):
                 raise InputError(f"{name}={axis!r}: expected different values, in a list")
-        given = self.own_values
         object.__setattr__(self, "values", values)
-        own_values = {name: given[name] if name in given else self._own_value(name) for name in values}
+        chosen = self.own_values
+        own_values = {name: chosen[name] if name in chosen else self._own_value(name) for name in values}
         object.__setattr__(self, "own_values", own_values)
         for name, value in ((name, value) for name, axis in values.items() for value in axis):  # before any work
             setting = self.setting({name: value})

@@ -63,7 +63,7 @@ def paper(data, monkeypatch, capsys):
 
 
 def files(out):
-    """Contents that do not depend on the time: every file but seconds and their figures, and results without them."""
+    """Contents that do not depend on the time: every file but the seconds; results.json without its seconds."""
     contents = {}
     for path in sorted(path for path in out.rglob("*") if path.is_file()):
         if path.parent.name == "seconds" or path.stem in ("run", "seconds", "report"):

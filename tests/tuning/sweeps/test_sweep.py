@@ -10,10 +10,12 @@ import pytest
 import mfvpr
 from mfvpr.core.scorer import with_parameters
 from mfvpr.core.types import Shortlist
-from mfvpr.evaluation import rankings
+from mfvpr.datasets import Positives
+from mfvpr.evaluation import DriveFilter, rankings
 from mfvpr.matchers import Scales
 from mfvpr.matchers.match_set import shapes
 from mfvpr.tuning import sweeps
+from mfvpr.tuning.sweeps import DriveRanking
 from mfvpr.tuning.sweeps.setting_rankings import group_by_program
 from mfvpr.utils import InputError
 from tests.builders import match_set_of, random_matches
@@ -63,7 +65,7 @@ def one_by_one(scorer, setting, match_set, candidates, view=None, **options):
     view = candidates.mask if view is None else view
     seen = replace(candidates, mask=candidates.mask & view)
     scores = np.array(scores, np.float32)
-    scores = rankings.fuse_shortlist(seen, scores, c) if fused else scores
+    scores = np.asarray(rankings.fuse(seen.scores, scores, seen.mask, c)) if fused else scores
     order = rankings.rank_shortlist(seen, scores, **options)
     return np.where(np.take_along_axis(seen.mask, order, 1), np.take_along_axis(candidates.indices, order, 1), -1)
 
@@ -186,7 +188,9 @@ def test_rows_of_other_data_options_or_scorers_in_the_same_folder_are_not_taken(
     matches, listed = data
     view, histogram = np.random.default_rng(1).random(listed.mask.shape) < 0.6, mfvpr.HistogramOfShifts(bin_size=20.0)
     other_indices = np.where(listed.mask, listed.indices[:, ::-1], -1)
-    for changed_matches, changed_listed, scorer, options in (
+    excluded = Positives.from_rows([[query] for query in range(QUERIES)], DATABASE)
+    causal = DriveRanking(DriveFilter("causal"), DATABASE)
+    cases = [
         (matches, listed, histogram, {}),
         (with_points(matches, lambda points: points[::-1].copy()), listed, histogram, {}),
         (matches, replace(listed, indices=other_indices), histogram, {}),
@@ -198,11 +202,16 @@ def test_rows_of_other_data_options_or_scorers_in_the_same_folder_are_not_taken(
         (matches, listed, mfvpr.AggregatedScore(), {"views": [~view]}),
         (matches, listed, mfvpr.AggregatedScore(), {"ties": "index"}),
         (matches, listed, mfvpr.AggregatedScore(), {"retrieval_score": "negative_euclidean"}),
-    ):
+        (matches, listed, mfvpr.AggregatedScore(), {"ks": [2]}),
+        (matches, listed, mfvpr.AggregatedScore(), {"sequence": causal}),
+        (matches, listed, mfvpr.AggregatedScore(), {"sequence": replace(causal, excluded=excluded)}),
+    ]
+    for number, (changed_matches, changed_listed, scorer, options) in enumerate(cases, start=1):
         settings = [{"max_distance": limit, "c": c} for limit, c in ((0.3, 0.5), (2.0, 0.5), (2.0, 20.0))]
         expected = rank(scorer, settings, changed_matches, changed_listed, **options)
         stored = rank(scorer, settings, changed_matches, changed_listed, **options, folder=tmp_path)
         np.testing.assert_array_equal(stored, expected)
+        assert len([*tmp_path.iterdir()]) == number
 
 
 def test_results_of_a_scorer_without_a_recipe_are_not_kept(data, tmp_path):
