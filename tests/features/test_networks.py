@@ -76,13 +76,14 @@ def test_aliked_recognizes_the_street(evaluate, real_weights, tmp_path, monkeypa
 def test_lightglue_matches_the_street_and_its_store_is_its_own(evaluate, real_weights, tmp_path, monkeypatch):
     monkeypatch.setenv("MFVPR_WEIGHTS", str(real_weights))
     features = ("features=aliked", "features.image_size=[160,160]", "retrieval.num_words=8")
-    messages, rows = [], {}
+    rows, stored = {}, []
     for name in ("neighbors", "lightglue", "lightglue"):
-        out = f"out{len(messages)}"
-        messages.append(evaluate("candidates=3", "figures=0", *features, f"matching={name}", out=out))
+        out = f"out{len(stored)}"
+        evaluate("candidates=3", "figures=0", *features, f"matching={name}", out=out)
         rows[name] = read_rows(tmp_path / out)
-    assert "matches: 10 queries with 3 candidates" in messages[1]
-    assert "matches: 10 queries with 3 candidates" not in messages[2]
+        stored.append({path: path.stat().st_mtime_ns for path in (tmp_path / "cache").rglob("*matches*/*")})
+    assert len(stored[0]) < len(stored[1])
+    assert stored[1] == stored[2]
     assert rows["lightglue"][0]["matching"]["weights"] == "aliked_lightglue"
     assert store_names(tmp_path).count("matches") == 2
     recall = {
