@@ -41,14 +41,12 @@ def test_every_conf_composes_and_passes_its_own_checks(group, choice):
 
 @pytest.mark.parametrize(("arguments", "words"), [
     (["system=ssm_vpr", "features=sift"], r"scorer=grid: expected features=ssm, .*got sift"),
-    (["system=ssm_vpr", "features.image_size=[224,224]"], r"scorer.side=40: .*26 x 26"),
     (["features=aliked", "features.image_size=null"], "features.image_size=null: expected a list of 2"),
     (["system=ssm_vpr", "matching.cross_check=mutual"], "cross_check=mutual: expected candidate"),
 ])  # fmt: skip
-def test_cells_must_be_as_many_as_their_score_expects(arguments, words):
+def test_settings_that_do_not_fit_together_are_refused(arguments, words):
     with pytest.raises(InputError, match=words):
         settings_of(*arguments)
-    settings_of("system=ssm_vpr", "features.image_size=[224,224]", "scorer.side=26")
 
 
 def test_scorers_of_conf_are_as_their_fields_say():
