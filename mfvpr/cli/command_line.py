@@ -134,8 +134,7 @@ def load_system(name: str | Path = "mfvpr", **settings: Any) -> System:
     else:
         with reading(Path(name), "the run.json of a run of mfvpr evaluate"):
             values = json.loads(Path(name).read_text(encoding="utf-8"))["settings"]
-    of_run = from_values(schema.Evaluate, values)
-    return assembly.system(of_run, of_run.previous_queries, of_run.sequence)
+    return assembly.system(from_values(schema.Evaluate, values))
 
 
 def override(name: str, value: Any) -> str:

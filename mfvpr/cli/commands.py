@@ -192,12 +192,11 @@ def write_page(runs: list[Path], *, out: Path | None = None) -> None:
 
     `out` is by default RUN/report.html of one run, and comparison.html here of several.
     """
-    path = out or Path("comparison.html")
     if len(runs) == 1:
-        path = write_report(runs[0], out)
+        out = write_report(runs[0], out)
     else:
-        write_comparison(runs, path)
-    print(printable(f"report: {path}"))
+        write_comparison(runs, out := out or Path("comparison.html"))
+    print(printable(f"report: {out}"))
 
 
 def convert(

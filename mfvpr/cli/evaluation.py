@@ -60,7 +60,7 @@ def evaluate(settings: Evaluate) -> None:
 
 def evaluation_of(settings: Evaluate) -> Outcome:
     """Evaluate the retrieval, each scorer, alone, and the main scorer fused with the retrieval."""
-    rankings, watch = assembly.rankings(settings, settings.previous_queries, settings.sequence), Stopwatch()
+    rankings, watch = assembly.rankings(settings), Stopwatch()
     if settings.confidence is not None:
         read_confidences(expand_user(settings.confidence))  # errors come before anything slow
     inputs = prepare(settings, watch)

@@ -5,7 +5,7 @@ A choice that is named in a file is looked up here; nothing else can be made.
 
 import math
 import re
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, field, fields, replace
 from functools import cache
@@ -202,6 +202,8 @@ class SystemSettings:
     fusion: FusionSettings = field(default=FusionSettings())
     final: str = setting("score", one_of("score", "combined"), "what decides: the score, or combined with retrieval")
     ties: Ties = setting("retrieval", word_of(Ties), "equal scores keep the order of retrieval, or of the database")
+    previous_queries: int = 0  # only of evaluations, as is the next
+    sequence: Any = None
 
     def __post_init__(self) -> None:
         """Raise an InputError for settings that are not allowed, by themselves or together."""
@@ -344,14 +346,12 @@ def pipeline(settings: SystemSettings, data: Dataset | None) -> Pipeline:
     return Pipeline(local, finder, match, settings.candidates, pixels)
 
 
-def system(settings: SystemSettings, previous_queries: int = 0, sequence: str | Sequence[str] | None = None) -> System:
-    """The system that the settings name, without files of other programs; further arguments as of `rankings`."""
-    return System(pipeline(settings, None), **rankings(settings, previous_queries, sequence))
+def system(settings: SystemSettings) -> System:
+    """The system that the settings name, without files of other programs."""
+    return System(pipeline(settings, None), **rankings(settings))
 
 
-def rankings(
-    settings: SystemSettings, previous_queries: int = 0, sequence: str | Sequence[str] | None = None
-) -> dict[str, Any]:
+def rankings(settings: SystemSettings) -> dict[str, Any]:
     """All of a system but its pipeline: the main scorer is fused with the retrieval.
 
     The ranking that decides is also made with the places of previous queries, and of the queries as a sequence.
@@ -364,13 +364,14 @@ def rankings(
     with in_group("fusion", ("c", "weights", "retrieval_score")):
         fusion.check(main, tuple(chosen))
     headline = fusion.system(main) if settings.final == "combined" else main
+    sequence, previous = settings.sequence, settings.previous_queries
     methods: list[Any] = [sequence] if isinstance(sequence, str) else [*(sequence or ())]
     if len({*methods}) < len(methods):
         raise InputError(f"sequence=[{','.join(methods)}]: expected every method once")
     return {
         "scorers": chosen,
         "fused": {main: fusion},
-        "correlated": {headline: FrameCorrelation(previous_queries)} if previous_queries else {},
+        "correlated": {headline: FrameCorrelation(previous)} if previous else {},
         "ties": settings.ties,
         "sequences": {headline: tuple(map(DriveFilter, methods))} if methods else {},
         "final": headline,

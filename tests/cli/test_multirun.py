@@ -46,12 +46,9 @@ def test_a_joint_table_has_a_line_per_job_and_system(root, tmp_path, monkeypatch
     lines = csv_rows(joint / "table.csv")
     assert [line["candidates"] for line in lines] == ["4", "4", "4", "8", "8", "8"]
     for number in (0, 3):
-        assert [line["system"] for line in lines[number : number + 3]] == ["retrieval", "sum", "sum + retrieval"]
-        names = [name for name in lines[number] if name.startswith("R@")]
         rows = csv_rows(tmp_path / lines[number]["run"] / "table.csv")
-        assert [[row[name] for name in names] for row in rows] == [
-            [line[name] for name in names] for line in lines[number : number + 3]
-        ]
+        for line, row in zip(lines[number:], rows, strict=False):
+            assert row.items() <= line.items()
 
 
 @pytest.mark.slow
