@@ -107,11 +107,10 @@ def open_torch_archive(file: BinaryIO) -> Iterator[tuple[zipfile.ZipFile, str, B
         yield archive, pickles[0].removesuffix("data.pkl"), io.BytesIO(archive.read(pickles[0]))
 
 
-def read_matlab(file: BinaryIO, *, text: bool = False) -> dict[str, np.ndarray]:
+def read_matlab(file: BinaryIO) -> dict[str, np.ndarray]:
     """Read arrays by path: `variable.field.0.field`, with 0, 1, ... for elements of a cell or an array of structures.
 
-    Reads versions 4 to 7.2. If `text`, lines of text are read as well, as arrays of one string. SciPy's errors are
-    raised if the file is damaged.
+    Reads versions 4 to 7.2. SciPy's errors are raised if the file is damaged.
     """
     arrays = {}
 
@@ -124,8 +123,6 @@ def read_matlab(file: BinaryIO, *, text: bool = False) -> dict[str, np.ndarray]:
         elif value.dtype == object:  # a cell
             for place, part in enumerate(value.ravel(order="F")):
                 collect(f"{path}.{place}", part)
-        elif value.dtype.kind == "U" and value.size == 1 and text:
-            arrays[path] = np.array(value.item())
         elif value.dtype.kind in "fiu" and value.size:
             arrays[path] = value
 

@@ -253,16 +253,14 @@ QUERY, PREDICTIONS, POSITIVES = "Query path:", "Predictions paths:", "Positives 
 _NAMES = ("img0_path", "img1_path")  # vismatch's
 _LAYOUTS = (("points0", "points1", "confidence"), ("matched_kpts0", "matched_kpts1", "matched_confidences"))
 _INLIERS = ("inlier_kpts0", "inlier_kpts1", "")
-_NUMBERED = ("keypoints0", "keypoints1", "matches", "match_confidence")  # SuperGlue's
 _SIZES = ("image_size0", "image_size1", "im_size")  # the last: side of vismatch's square images
-_PARTS = {*_NAMES, *chain(*_LAYOUTS), *_INLIERS, *_NUMBERED, *_SIZES}
+_PARTS = {*_NAMES, *chain(*_LAYOUTS), *_INLIERS, *_SIZES}
 
 
 def open_results(path: Path, names: tuple[Sequence[str], Sequence[str]], verified: bool = False) -> PairFiles:
     """A folder of files of a pair, which have the `names` of the images in them or in their own names.
 
-    `SuperGlue` names a file `STEM_STEM_matches.npz`, with the query first. Such names have no folders, so that queries
-    and database images may have the same names: `sided`.
+    Names of files, `QUERY_DATABASE.npz`, have no folders, so that both sides may have the same names: `sided`.
     """
     stems = [{PurePosixPath(name).stem for name in side} for side in names]
     places: dict[Pair, Path] = {}
@@ -365,19 +363,5 @@ def _matches_of(file: Path, result: Mapping[str, Any], verified: bool) -> FileMa
     for first, second, confidence in (_INLIERS,) if verified else _LAYOUTS:
         if first in parts and second in parts:
             return FileMatches(parts[first], parts[second], parts.get(confidence), sizes)
-    if verified or not {*_NUMBERED[:3]} <= parts.keys():
-        expected = " and ".join(_INLIERS[:2]) if verified else "points0 and points1, or matched_kpts0 and matched_kpts1"
-        raise InputError(f"{file}: expected {expected}, got {shorten(', '.join(sorted(parts))) or 'none'}")
-    points0, points1, numbers = (parts[name] for name in _NUMBERED[:3])
-    confidence = parts.get(_NUMBERED[3], np.ones(numbers.shape))
-    is_fitting = points1.ndim == 2 and numbers.dtype.kind in "iu"
-    is_fitting &= points0.shape[:1] == numbers.shape == confidence.shape
-    if not is_fitting or (numbers < -1).any() or (numbers >= len(points1)).any():
-        raise InputError(
-            f"{file}: expected keypoints0 [N, 2], keypoints1 [M, 2], matches [N] from -1 to M - 1, "
-            "match_confidence [N], got others"
-        )
-    real = numbers >= 0
-    return FileMatches(
-        points0[real], points1[numbers[real]], confidence[real] if _NUMBERED[3] in parts else None, sizes
-    )
+    expected = " and ".join(_INLIERS[:2]) if verified else "points0 and points1, or matched_kpts0 and matched_kpts1"
+    raise InputError(f"{file}: expected {expected}, got {shorten(', '.join(sorted(parts))) or 'none'}")

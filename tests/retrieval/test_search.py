@@ -132,7 +132,7 @@ def test_recall(seed, depth):
         recall_at_k(np.stack([order, order]), positives, ks)
     expected = oracles.recall_at_k(order, positives, ks)
     np.testing.assert_allclose(recall_at_k(order, positives, ks), expected)
-    np.testing.assert_array_equal(recall_at_k(order, Positives.from_matrix(positives), ks), expected)
+    np.testing.assert_array_equal(recall_at_k(order, Positives(positives), ks), expected)
 
 
 def test_descriptors_of_different_lengths_and_masks_of_another_shape_are_refused():
