@@ -65,13 +65,9 @@ class Contents:
 
 
 def contents(folder: ImageFolder, cache: Path | str | None = None) -> Contents:
-    """The contents of the files of `folder`.
+    """The contents of the files of `folder`, `contents(mfvpr.datasets.image_folder("day/")).fingerprint`.
 
-        contents(mfvpr.datasets.image_folder("day/")).fingerprint
-
-    Args:
-        cache: folder of the record files; None = all files are read. A record file that is damaged, or that another
-            process replaces meanwhile, costs time only.
+    `cache` is the folder of the record files; None = all files are read. A damaged record file costs time only.
     """
     root = folder.root.absolute()
     name = f"{hashlib.sha256(os.fsencode(root)).hexdigest()[:32]}-{FORMAT}.json"
@@ -99,11 +95,7 @@ def fingerprints(contents: Mapping[str, Contents]) -> dict[str, str]:
 
 
 def own_rows(queries: Contents, database: Contents) -> OwnRows:
-    """For each of the `queries`, the rows of files in the `database` with the same content.
-
-    Example:
-        own_rows(contents(data.queries), contents(data.database))
-    """
+    """For each of the `queries`, the rows of files in the `database` with the same content."""
     rows = defaultdict(list)
     for row, file in enumerate(database.files):
         rows[file.sha256].append(row)

@@ -247,8 +247,7 @@ def truth_from_file(
     """Ground truth from an index file.
 
     * `.csv`: a header with the columns `query` and `database` (or SSM-VPR's `Live` and `Reference`), then one line per
-      pair: file names, or numbers from 0 in file order. A query may have several lines; an empty database cell means
-      that its place is not in the database.
+      pair: file names, or numbers from 0 in file order. An empty database cell means that the place is unknown.
     * `.npz`: arrays `query` and `database`, the same pairs; or Patch-NetVLAD's `utmQ` and `utmDb`.
     * `.json`: VPR-Bench's `[[query, [database, ...]], ...]`.
 

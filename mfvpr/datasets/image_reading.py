@@ -99,8 +99,6 @@ def open_image(file: Path | str | BinaryIO) -> ImageFile.ImageFile:
 def shape_size(shape: tuple[int, int], pixels: float, multiple: int = 1) -> tuple[int, int]:
     """(width, height) px of about `pixels` in all, in the shape of an image of `shape` (width, height).
 
-        shape_size((1920, 1080), 100_000)  # (421, 237)
-
     Both sides are a `multiple`: the shorter one is rounded, then the longer one in its proportion.
     """
     short, long = sorted(shape)

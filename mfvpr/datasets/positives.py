@@ -88,13 +88,9 @@ class Positives:
         return Positives(self.matrix[np.arange(len(self))[queries]])
 
     def contains(self, rows: Any) -> Bool[np.ndarray, "*batch queries k"]:
-        """Whether rankings are correct: for each row, whether it is among the query's rows; -1 never is.
+        """Whether rankings are correct: whether each of `rows` `[..., Q, k]` is among the query's rows; -1 never is.
 
-        Args:
-            rows: `[..., Q, k]` of each query; leading axes hold several rankings.
-
-        Raises:
-            InputError: another number of queries, or rows beyond the database.
+        An `InputError` for another number of queries, or rows beyond the database.
         """
         rows = np.asarray(rows)
         is_valid = rows.ndim >= 2 and rows.shape[-2] == len(self)
@@ -131,6 +127,9 @@ def stack_positives(parts: Sequence[Positives]) -> Positives:
 
 def positives_within(query_xy: np.ndarray, database_xy: np.ndarray, radius: float) -> Positives:
     """Database images at most `radius` meters away from each query; coordinates as in `radius_positives`."""
+    for xy in (query_xy, database_xy):
+        if np.size(xy) and np.shape(xy)[1:] != (2,):
+            raise InputError(f"positions: expected (x, y) [images, 2] in meters, got shape {np.shape(xy)}")
     queries, database = (scipy.spatial.KDTree(np.reshape(xy, (-1, 2))) for xy in (query_xy, database_xy))
     pairs = queries.sparse_distance_matrix(database, radius, output_type="ndarray")
     content = np.ones(len(pairs), bool), (pairs["i"], pairs["j"])

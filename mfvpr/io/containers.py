@@ -31,13 +31,10 @@ class FileEntry(NamedTuple):
 class H5File:
     """An hloc file: images are the groups that hold datasets, named by their relative paths.
 
-    Attributes:
-        path: of the file, for messages.
-        entries: place of each image's arrays, by its name in the file.
-        transposed: whether descriptors are `[D, N]` if their shapes fit both layouts.
+    `entries` are the places of the images' arrays by name.
     """
 
-    transposed = True
+    transposed = True  # descriptors are `[D, N]` if their shapes fit both layouts
 
     def __init__(self, path: Path) -> None:
         self.path, names = path, list[str]()
@@ -78,9 +75,8 @@ class H5File:
 class NpzFiles:
     """One archive for all images, or a folder with an archive for each image; attributes as of `H5File`.
 
-    In one archive, arrays are named `image/part`: `a/1.jpg/keypoints`. Every call reads its directory, which takes half
-    a second for 10,000 images: request many images at once. In a folder, files are `a/1.jpg.npz` or `a/1.jpg.d2-net`;
-    hidden files and folders are skipped, and links to folders are not followed.
+    In one archive, arrays are named `image/part`: `a/1.jpg/keypoints`; request many images at once, since every call
+    reads its directory. In a folder, files are `a/1.jpg.npz` or `a/1.jpg.d2-net`; hidden ones are skipped.
     """
 
     transposed = False
@@ -234,10 +230,8 @@ def match_names(path: Path, names: Sequence[str], foreign: Iterable[str]) -> lis
         foreign: all names in the file; names of other images are ignored.
 
     Returns:
-        `[M]` names in the file; None = the file lacks the image.
-
-    Raises:
-        InputError: an image has several possible names, images have different prefixes, or two images have one name.
+        `[M]` names in the file; None = the file lacks the image. An `InputError` if an image has several possible
+        names, images have different prefixes, or two images have one name.
     """
     require_different(path, names)
     foreign = dict.fromkeys(foreign)
@@ -305,8 +299,7 @@ def require_one_image(
 ) -> None:
     """Raise an InputError if an entry of a file stands for two images, unless both paths lead to one file.
 
-    `images` and `entries` `[M]` are of a folder; None = the file lacks the image. They are added to `known`, the images
-    of the entries of earlier folders.
+    `entries` `[M]` of `images` are added to `known`, those of earlier folders; None = the file lacks the image.
     """
     resolved = {entry.file: entry.file.resolve() for entry in entries if entry is not None}
     for image, entry in zip(images, entries, strict=True):

@@ -1,9 +1,5 @@
 """Read features and global descriptors that other programs extracted, and write them for other programs.
 
-    features = open_features(Path("feats-d2net-ss.h5"), dataset.database.names)
-    for row, image_features in features.read([3, 14]):
-        ...
-
 Parts of an image in a file:
 
 - `keypoints` `[N, 2]` (x, y), px, pixel centers at whole numbers; up to two more columns (scale, angle) are ignored;
@@ -50,17 +46,11 @@ PARTS = ("keypoints", "descriptors", *SCORES, "image_size")
 
 @dataclass(frozen=True, eq=False)
 class ImportedFeatures:
-    """Features of M images in files of another program, made by `open_features`.
+    """Features of M images in files of another program, made by `open_features`."""
 
-    Attributes:
-        path: file or folder.
-        counts: keypoints of each image, -1 = missing image.
-        dimension: D; 0 if no image has a keypoint.
-    """
-
-    path: Path
-    counts: Int32[np.ndarray, " images"]
-    dimension: int
+    path: Path  # file or folder
+    counts: Int32[np.ndarray, " images"]  # keypoints of each image, -1 = missing image
+    dimension: int  # D; 0 if no image has a keypoint
     _container: H5File | NpzFiles
     _images: Sequence[str | None]
     _transposed: bool

@@ -24,20 +24,13 @@ _ROUNDING = 1e-3  # by which a confidence may leave 0 to 1
 
 
 class Images(NamedTuple):
-    """Images of one side.
+    """Images of one side; their names are matched as in `containers.match_names`."""
 
-    names: relative POSIX paths, as `ImageFolder.names`, matched as in `containers.match_names`.
-    paths: full paths, by which an image that is on both sides is known; () = unknown.
-    has_prefix: whether names have a prefix as in the file; without one, paths are tried before the names.
-    size: size of the image file of a row; None = unknown.
-    features: of these images, for files of matches without keypoints.
-    """
-
-    names: Sequence[str]
-    paths: Sequence[str] = ()
-    has_prefix: bool = False
-    size: Callable[[int], Size] | None = None
-    features: ImportedFeatures | None = None
+    names: Sequence[str]  # relative POSIX paths, as `ImageFolder.names`
+    paths: Sequence[str] = ()  # full paths, by which an image that is on both sides is known; () = unknown
+    has_prefix: bool = False  # whether names have a prefix as in the file; without one, paths are tried before names
+    size: Callable[[int], Size] | None = None  # of the image file of a row
+    features: ImportedFeatures | None = None  # for files of matches without keypoints
 
 
 class ImportedMatches:
@@ -76,8 +69,7 @@ class ImportedMatches:
     def read(self, query: int, candidates: Sequence[int]) -> list[Matches | None]:
         """Matches `[n]` of a query with each candidate, NumPy, without padding; None = the file lacks the pair.
 
-        Raises:
-            InputError: matches are damaged, beyond the keypoints or the images, or confidences beyond 0 to 1.
+        An `InputError` for damaged matches, or values beyond the keypoints, the images, or 0 to 1 for confidences.
         """
         pairs = {row: pair for row in candidates if (pair := self._pair(query, row)) is not None}
         contents = self._files.read([self._files.places[pair] for pair in pairs.values()])

@@ -57,23 +57,18 @@ class ArrayUnpickler(DataUnpickler):
     """Unpickler of NumPy's arrays among plain data; paths become text."""
 
     names: ClassVar = {
-        **dict.fromkeys(
-            ("numpy.core.multiarray._reconstruct", "numpy._core.multiarray._reconstruct"),
-            Function(lambda *_: np.ndarray(0, np.int8)),  # which the pickle fills
-        ),
-        "numpy.ndarray": Function(np.ndarray),
-        "numpy.dtype": Function(lambda code, *_: np.dtype(code, copy=True)),  # NumPy's own types stay as they are
-        "_codecs.encode": Function(lambda text, *_: text.encode("latin-1")),  # bytes in protocols that have none
-        "__builtin__.bytes": Function(bytes),  # of an array without values
-        "builtins.bytes": Function(bytes),
-        **dict.fromkeys(
-            ("pathlib.PosixPath", "pathlib._local.PosixPath"),
-            Function(lambda *parts: PurePosixPath(*parts).as_posix()),
-        ),
-        **dict.fromkeys(
-            ("pathlib.WindowsPath", "pathlib._local.WindowsPath"),
-            Function(lambda *parts: PureWindowsPath(*parts).as_posix()),
-        ),
+        f"{module}.{name}": Function(stand_in)
+        for modules, name, stand_in in (
+            # An empty array, which the pickle fills.
+            (("numpy.core.multiarray", "numpy._core.multiarray"), "_reconstruct", lambda *_: np.ndarray(0, np.int8)),
+            (("numpy",), "ndarray", np.ndarray),
+            (("numpy",), "dtype", lambda code, *_: np.dtype(code, copy=True)),  # NumPy's own types stay as they are
+            (("_codecs",), "encode", lambda text, *_: text.encode("latin-1")),  # bytes in protocols that have none
+            (("__builtin__", "builtins"), "bytes", bytes),  # of an array without values
+            (("pathlib", "pathlib._local"), "PosixPath", lambda *parts: PurePosixPath(*parts).as_posix()),
+            (("pathlib", "pathlib._local"), "WindowsPath", lambda *parts: PureWindowsPath(*parts).as_posix()),
+        )
+        for module in modules
     }
 
 

@@ -103,14 +103,9 @@ def read_poses(path: Path | str, names: Sequence[str]) -> list[str]:
 
 
 def write_trajectory(path: Path | str, poses: Sequence[str | None], stamps: Sequence[int] | None = None) -> None:
-    """Write the poses of localized images, atomically, digit for digit.
-
-        poses = mfvpr.io.read_poses("database.tum", data.database.names)
-        stamps = mfvpr.io.stamps_in_names(data.queries.names)
-        write_trajectory("queries.tum", [poses[row] for row in rows], stamps)  # database rows of the predictions
+    """Write the poses of localized images to a new text file, atomically, digit for digit.
 
     Args:
-        path: new text file.
         poses: `[Q]` texts of 7 numbers (TUM) or 12 (KITTI), as `read_poses` returns them; None = no place, which a
             frame of KITTI must have.
         stamps: `[Q]` different times in ns, for TUM, whose lines are in their order; None for KITTI.

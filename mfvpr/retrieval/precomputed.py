@@ -136,10 +136,6 @@ def _cut(shortlist: Shortlist, num_candidates: int) -> Shortlist:
 class MatchFiles:
     """Matches of another program in place of a matcher, see `mfvpr.io.open_matches` for `verified` and `confidences`.
 
-        files = {data.queries.root: File("matches.h5")}
-        features = {folder.root: File("feats.h5") for folder in (data.queries, data.database)}
-        pipeline = mfvpr.Pipeline(extractor, retriever, MatchFiles(files, features=features))
-
     The extractor of the pipeline is used only for retrieval.
     """
 
@@ -159,7 +155,6 @@ class MatchFiles:
 
     @property
     def inputs(self) -> Literal["images"]:
-        """See `mfvpr.matchers.host_matcher.PairSource`."""
         return "images"
 
     def open(self, queries: ImageFolder, database: ImageFolder) -> ImportedMatches:
@@ -184,8 +179,8 @@ class MatchFiles:
 
 
 def _file_of(files: Mapping[Path, File], folder: ImageFolder) -> File:
-    files = {Path(root): file for root, file in files.items()}
-    if folder.root not in files:
+    file = {Path(root): file for root, file in files.items()}.get(folder.root)
+    if file is None:
         known = ", ".join(map(str, files)) or "none"
         raise InputError(f"{folder.root}: expected a folder that has a file, one of: {known}; give one for it as well")
-    return files[folder.root]
+    return file

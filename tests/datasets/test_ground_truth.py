@@ -8,15 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from mfvpr import InputError, datasets
-from mfvpr.datasets import (
-    AllowedTruth,
-    FrameTruth,
-    IndexFile,
-    LabelFiles,
-    LabelTruth,
-    Positives,
-    RadiusTruth,
-)
+from mfvpr.datasets import AllowedTruth, FrameTruth, IndexFile, LabelFiles, LabelTruth, Positives, RadiusTruth
 from mfvpr.datasets.ground_truth import threshold_words
 from mfvpr.utils.files import write_text
 from tests import oracles
