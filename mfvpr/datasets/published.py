@@ -218,7 +218,7 @@ def msls_val(root: Path) -> Content:
     lists = [root / f"msls_val_{part}.npy" for part in ("dbImages", "qImages", "pIdx", "qIdx")]
     if any(path.exists() for path in lists):
         return content_of_lists(root, *lists)
-    flags = {"true": True, "1": True, "false": False, "0": False}  # as pandas reads them
+    flags = {"True": True, "False": False}
     names, positions = {"database": [], "query": []}, {"database": [], "query": []}
     for side, city in product(names, CITIES):
         folder, tables = root / "train_val" / city / side, []
@@ -233,7 +233,7 @@ def msls_val(root: Path) -> Content:
         with reading(folder / "postprocessed.csv", mend=mend):
             processed, raw, tasks = tables
             for key, line in processed.items():
-                if flags[tasks[key]["all"].lower()] and not flags[raw[key]["pano"].lower()]:
+                if flags[tasks[key]["all"]] and not flags[raw[key]["pano"]]:
                     names[side].append(f"train_val/{city}/{side}/images/{key}.jpg")
                     positions[side].append([parse_number(line["easting"]), parse_number(line["northing"])])
     places = {
