@@ -158,7 +158,8 @@ def plan_drives(seed: int, count: int, image_size: tuple[int, int]) -> tuple[lis
     rng = np.random.default_rng([seed, 6])
     queries = _weave(rng, count, image_size)
     wobble = 0.3 * _DEGREE * rng.standard_normal((2, count))
-    return [Camera(LANE, query.z, *turn, image_size) for query, turn in zip(queries, wobble.T, strict=True)], queries
+    poses = zip(queries, *wobble, strict=True)
+    return [Camera(LANE, query.z, heading, pitch, image_size) for query, heading, pitch in poses], queries
 
 
 def plan_return(seed: int, number: int, count: int, image_size: tuple[int, int]) -> list[Camera]:
