@@ -13,7 +13,7 @@ from mfvpr.cli.console import tell, track, warn
 from mfvpr.cli.schema import Common, RecallSettings
 from mfvpr.core.types import Shortlist
 from mfvpr.datasets import Dataset, IndexFile, LabelFiles
-from mfvpr.datasets.contents import Contents, fingerprints, own_rows, readings
+from mfvpr.datasets.contents import Contents, fingerprints, own_rows
 from mfvpr.datasets.ground_truth import CHOICES, threshold_words
 from mfvpr.datasets.published import published_dataset, published_differences
 from mfvpr.datasets.streets import CONDITIONS, TRUTH, streets_folder
@@ -55,8 +55,8 @@ class Inputs(Generic[Job]):
     @property
     def about(self) -> dict[str, Any]:
         """The data set in results."""
-        data = {"data_fingerprint": fingerprints(self.contents), "reading": readings(self.contents)}
-        return {"dataset": self.dataset.name, **data, "ground_truth": self.ground_truth}
+        seen = fingerprints(self.contents)
+        return {"dataset": self.dataset.name, "data_fingerprint": seen, "ground_truth": self.ground_truth}
 
     def protocol(self, split: Split | None) -> EvaluationProtocol:
         """The protocol of rankings for sweeps and learning."""
@@ -194,7 +194,7 @@ def _warn_of_data(dataset: Dataset, contents: Mapping[str, Contents], thresholds
         elif without:
             words = ", ".join(threshold_words(truth.unit, threshold).strip() for threshold in without)
             warn(f"no query has a correct image within {words}; recall will be 0 there; use larger recall.tolerances")
-    largest = max(reading["largest_16bit"] or 0 for reading in readings(contents).values())
+    largest = max(file.largest for images in contents.values() for file in images.files)
     used, bits = max(largest.bit_length(), 8), dataset.database.bits
     if largest and bits is not None and not bits - 1 <= used <= bits:
         look = "dark" if used < bits else "cut off"

@@ -93,7 +93,7 @@ def test_pairs_of_an_index_file_are_all_that_is_right_unless_asked(small_street,
     assert recall(exact) == recall(widened, tolerance=0)
 
 
-def test_dark_16_bit_images_are_told(tmp_path, capsys):
+def test_images_of_12_bits_in_files_of_16_are_warned_of(tmp_path, capsys):
     for side in ("database", "queries"):
         (tmp_path / side).mkdir()
         Image.fromarray(np.full((120, 160), 4095, np.uint16)).save(tmp_path / side / "0.png")

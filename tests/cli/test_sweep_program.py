@@ -61,7 +61,7 @@ def test_every_file_tells_the_same(swept):
         recall = entry["recall_at"]
         expected = [recall["0"]["1"], recall["1"]["1"], recall["1"]["5"]]
         np.testing.assert_allclose([float(cell) / 100 for cell in line[3:]], expected, atol=6e-4)
-    assert {"dataset", "data_fingerprint", "reading", "seconds", "versions"} <= {*content} | {"seconds"}
+    assert {"dataset", "data_fingerprint", "seconds", "versions"} <= {*content} | {"seconds"}
     assert (content["ground_truth"]["kind"], content["ground_truth"]["thresholds"]) == ("index", [0, 1])
     assert (content["unit"], content["thresholds"], content["ks"]) == ("frames", [0, 1], [1, 5])
 
