@@ -5,10 +5,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from PIL import Image
 
 from mfvpr.evaluation import precision_recall, read_confidences, reliability
-from mfvpr.evaluation.system import noise_images
 from tests.programs import QUERIES, csv_rows, small
 
 pytestmark = pytest.mark.slow
@@ -117,23 +115,6 @@ def test_no_place_is_right_where_the_database_does_not_show_it(evaluate, confide
     hits = [str(int(line["histogram"] == "1")) for line in csv_rows(out / "gains.csv")]
     assert [line["correct"] for line in predictions] == hits
     assert hits[0] == "0"
-
-
-def test_unusable_queries_are_refused_whatever_the_threshold(evaluate, confidence, root, tmp_path):
-    """A lens cap and noise among the queries, without ground truth."""
-    (tmp_path / "queries").mkdir()
-    for name, image in {
-        "black": np.zeros((96, 128, 3), np.uint8),
-        "noise": noise_images((128, 96), seeds=(9,))[0],
-    }.items():
-        Image.fromarray(image).save(tmp_path / "queries" / f"{name}.png")
-    queries = ("dataset.ground_truth=none", "dataset.index_file=null", f"dataset.queries={tmp_path}/queries")
-    out, *_ = evaluate("second", f"confidence={confidence}", "threshold=0", *queries)
-    top = {line["query"]: line for line in csv_rows(out / "top_predictions.csv")}
-    assert {name: line["reason"] for name, line in top.items()} == {
-        "black.png": "too few features", "noise.png": "no better than noise"
-    }  # fmt: skip
-    assert {line["outcome"] for line in top.values()} == {"refused"}
 
 
 def test_confidence_of_other_settings_is_said(evaluate, confidence):

@@ -13,7 +13,6 @@ from mfvpr.cli import evaluation
 from mfvpr.cli.command_line import override
 from mfvpr.systems import assembly
 from mfvpr.systems.assembly import CONF
-from mfvpr.utils.errors import InputError
 from tests.programs import MFVPR, QUICK, ROOT, composed, csv_rows, folder, run, settings_of
 
 pytestmark = pytest.mark.thorough
@@ -37,16 +36,6 @@ def test_every_conf_composes_and_passes_its_own_checks(group, choice):
     programs = {"experiment": ["sweep"], "system": ["evaluate", "sweep", "learn"], "grid": ["learn"]}
     for config in programs.get(group, ["evaluate"]):
         settings_of(f"{group}={choice}", *needs, config=config)
-
-
-@pytest.mark.parametrize(("arguments", "words"), [
-    (["system=ssm_vpr", "features=sift"], r"scorer=grid: expected features=ssm, .*got sift"),
-    (["features=aliked", "features.image_size=null"], "features.image_size=null: expected a list of 2"),
-    (["system=ssm_vpr", "matching.cross_check=mutual"], "cross_check=mutual: expected candidate"),
-])  # fmt: skip
-def test_settings_that_do_not_fit_together_are_refused(arguments, words):
-    with pytest.raises(InputError, match=words):
-        settings_of(*arguments)
 
 
 def test_scorers_of_conf_are_as_their_fields_say():

@@ -72,10 +72,6 @@ def test_all_rows_in_every_file(learned):
         assert fit["values"]["temperature"] > 0
     assert [sorted(fit["values"]) for fit in trained] == 2 * [["temperature"], ["c", "temperature"]]
     assert any(fit["steps"] > 0 for fit in trained)
-
-
-def test_pictures_and_weights(learned):
-    out, _ = learned
     assert (out / "figures" / "curves.png").is_file()
     for name in ("match_weights", "match_weights_retrieval", "match_labels"):
         weight, origin = read_weight(out / "weights" / f"first_half_{name}.json")
