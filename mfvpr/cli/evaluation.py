@@ -66,7 +66,17 @@ def evaluation_of(settings: Evaluate) -> Outcome:
     inputs = prepare(settings, watch)
     values, figure_queries = to_values(inputs.settings), query_rows(settings.figures, inputs.dataset)
     system = System(inputs.pipeline, **{**rankings, "settings": values})
-    confidences = None if settings.confidence is None else _confidences(settings.confidence, system, inputs)
+    confidences = None
+    if settings.confidence is not None:
+        candidates = num_candidates(system.pipeline.candidates, inputs.dataset.database)
+        confidences, origin = fitting_confidences(settings.confidence, system, {**values, "candidates": candidates})
+        seen = {side: each for side, each in (origin.get("data_fingerprint") or {}).items() if side != "database"}
+        queries = {side: each for side, each in fingerprints(inputs.contents).items() if side != "database"}
+        if {*seen.values()} & {*queries.values()}:
+            warn(f"confidence={settings.confidence} was fitted on these very images, so that it flatters")
+        threshold = inputs.thresholds and [middle(inputs.thresholds), inputs.ground_truth["unit"]]
+        if threshold and threshold != origin.get("correct_within"):
+            warn(f"confidence={settings.confidence} was fitted with other settings of recall: it may mean nothing here")
     ranked = rank_dataset(inputs.dataset, system, cache=inputs.cache)
     ranked = replace(ranked, seconds={**watch.seconds, **ranked.seconds})
     lacking = None if settings.threshold is None else evidence_against(ranked, inputs.cache)
@@ -89,22 +99,6 @@ def query_rows(queries: int | list[int | str], dataset: Dataset) -> int | list[i
                 f"figures=[{query}]: expected rows from 0 to {len(names) - 1}, or names such as {next(iter(names))}"
             )
     return list(dict.fromkeys(rows))
-
-
-def _confidences(path: str, system: System, inputs: Inputs[Evaluate]) -> dict[str, Confidence]:
-    """`fitting_confidences` of a run; warns if the file was fitted on the same images, or with another recall."""
-    candidates = num_candidates(system.pipeline.candidates, inputs.dataset.database)
-    confidences, origin = fitting_confidences(path, system, {**(system.settings or {}), "candidates": candidates})
-    before, now = (
-        {side: each for side, each in folders.items() if side != "database"}
-        for folders in (origin.get("data_fingerprint") or {}, fingerprints(inputs.contents))
-    )
-    if {*before.values()} & {*now.values()}:
-        warn(f"confidence={path} was fitted on these very images, so that it flatters")
-    threshold = inputs.thresholds and [middle(inputs.thresholds), inputs.ground_truth["unit"]]
-    if threshold and threshold != origin.get("correct_within"):
-        warn(f"confidence={path} was fitted with other settings of recall: it may mean nothing here")
-    return confidences
 
 
 def fitting_confidences(

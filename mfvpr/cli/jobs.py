@@ -18,7 +18,7 @@ from mfvpr.datasets.ground_truth import CHOICES, threshold_words
 from mfvpr.datasets.published import published_dataset, published_differences
 from mfvpr.datasets.streets import CONDITIONS, TRUTH, streets_folder
 from mfvpr.evaluation import EvaluationProtocol, Pipeline, evaluation_protocol, match_sequence
-from mfvpr.evaluation.dataset_ranking import matches_recipe, num_candidates
+from mfvpr.evaluation.dataset_ranking import num_candidates
 from mfvpr.evaluation.protocol import Split
 from mfvpr.evaluation.system import folders_of
 from mfvpr.matchers import MatchSet, Scales
@@ -68,10 +68,6 @@ class Inputs(Generic[Job]):
         """Matches and shortlist of the only sequence, from their store if it has all of them."""
         result = match_sequence(self.dataset, self.dataset.only, self.pipeline, cache=self.cache)
         return result.by_scale, result.candidates
-
-    def recipe(self) -> dict[str, Any]:
-        """Recipe of the shortlist and the matches of the only sequence."""
-        return matches_recipe(self.dataset, self.dataset.only, self.pipeline, self.cache)
 
 
 def prepare(settings: Job, watch: Stopwatch) -> Inputs[Job]:

@@ -16,6 +16,7 @@ from mfvpr.cli.jobs import Inputs, prepare, score_in_words, truth_in_words
 from mfvpr.cli.schema import Learn
 from mfvpr.cli.sweeping import axes_of
 from mfvpr.datasets.contents import own_rows
+from mfvpr.evaluation.dataset_ranking import matches_recipe
 from mfvpr.matchers import Scales
 from mfvpr.report import comparisons, runs
 from mfvpr.systems.assembly import without
@@ -139,7 +140,7 @@ def _checkpoints(settings: Learn, axes: Axes, data: Part, sets: list[Prepared]) 
     if root is None:
         return None
     recipe = {
-        "matches": [each.inputs.recipe() for each in sets],
+        "matches": [matches_recipe(of.dataset, of.dataset.only, of.pipeline, of.cache) for _, of in sets],
         "scorer": recipe_of(axes.scorer),
         "tolerances": to_values(settings.recall),
         **{name: getattr(settings, name) for name in (*_TRAINING, "loss", "inputs")},
