@@ -13,15 +13,7 @@ import safetensors.numpy
 
 from mfvpr.checkpoints.checkpoint import read_checkpoint
 from mfvpr.checkpoints.conversion import RUNTIME, convert
-from mfvpr.checkpoints.networks import (
-    NETWORKS,
-    OWN,
-    Entry,
-    blueprint,
-    entry_of,
-    how_to_install,
-    own_entry,
-)
+from mfvpr.checkpoints.networks import NETWORKS, OWN, Entry, blueprint, entry_of, how_to_install, own_entry
 from mfvpr.io.containers import reading
 from mfvpr.utils.errors import InputError
 from mfvpr.utils.files import replacing, require_file
@@ -103,12 +95,9 @@ def save(
 def load(name: str) -> dict[str, np.ndarray]:
     """Read arrays by dotted path, and compare them with the hash of their file's metadata.
 
-    Raises:
-        InputError: the name is unknown.
-        WeightsError: the weights are not installed, or the file is damaged or of other weights.
+    An InputError for an unknown name, a WeightsError if they are not installed, damaged or other weights.
     """
-    provenance = read_provenance(name)
-    entry = installed_entry(name)
+    provenance, entry = read_provenance(name), installed_entry(name)
     with suppress(safetensors.SafetensorError):
         arrays = _read(_path(entry))[1]
         if _digest(arrays) == provenance["sha256"]:
@@ -119,9 +108,7 @@ def load(name: str) -> dict[str, np.ndarray]:
 def load_model(name: str) -> "nnx.Module":
     """Load the network of this name with its weights, ready for inference.
 
-    Raises:
-        InputError: the name is unknown.
-        WeightsError: as `load`; or the arrays do not fit the network.
+    An InputError for an unknown name, a WeightsError if the weights are not installed, damaged or other weights.
     """
     entry, arrays = installed_entry(name), load(name)
     try:
@@ -131,11 +118,10 @@ def load_model(name: str) -> "nnx.Module":
 
 
 def read_provenance(name: str) -> dict[str, Any]:
-    """Read the metadata of an installed file, but not its arrays.
+    """Read the metadata of an installed file, but not its arrays; errors are those of `load`.
 
-    They are the `name` of the weights, the `sha256` of the arrays, the number of `parameters` without running
-    statistics, `source_file` and `source_sha256`, and for weights of your own the published weights that they are
-    `like`. Errors are those of `load`.
+    They are `name`, the `sha256` of the arrays, the number of `parameters` without running statistics, `source_file`
+    and `source_sha256`, and for weights of your own the published weights that they are `like`.
     """
     entry = installed_entry(name)
     if not is_installed(entry):

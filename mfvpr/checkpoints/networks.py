@@ -186,13 +186,12 @@ def entry_of(name: str) -> Entry:
     raise InputError(f"{name}: no weights of this name; {hint}")
 
 
-@dataclass(frozen=True)
-class Blueprint:
+class Blueprint(NamedTuple):
     """A network without values, made without computing any."""
 
     shapes: Mapping[str, tuple[int, ...]]  # by dotted path; parameters and running statistics
     parameters: int  # without running statistics
-    _module: "nnx.Module"
+    module: "nnx.Module"
 
     def build(self, arrays: Mapping[str, np.ndarray]) -> "nnx.Module":
         """Build the network with these values, in evaluation mode; InputError if paths or shapes differ."""
@@ -200,7 +199,7 @@ class Blueprint:
         from flax import nnx
 
         arrays = jax.device_put(convert(arrays, RUNTIME, self.shapes))
-        graph, state = nnx.split(self._module)
+        graph, state = nnx.split(self.module)
         leaves = [(keys, leaf.replace(arrays[_path(keys)])) for keys, leaf in nnx.to_flat_state(state)]
         module = nnx.merge(graph, nnx.from_flat_state(leaves))
         module.eval()

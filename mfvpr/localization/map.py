@@ -7,12 +7,11 @@ import shutil
 import threading
 import warnings
 from collections import OrderedDict
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
-from functools import wraps
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any
 
 import jax
 import numpy as np
@@ -28,25 +27,9 @@ from mfvpr.evaluation.rankings import Ranked, rank_by_scores
 from mfvpr.evaluation.system import System, noise_images
 from mfvpr.features.feature_set import SHARE, check_features, strength
 from mfvpr.features.vlad import Vlad, VladFitting
-from mfvpr.localization.map_settings import (
-    describers_of,
-    fit_on_drive,
-    fit_to_map,
-    parts_of,
-    read_system,
-    system_fingerprint,
-)
+from mfvpr.localization import map_settings, query_steps
 from mfvpr.localization.predictions import Alternative, Localization, Prediction
-from mfvpr.localization.query_steps import (
-    Described,
-    Describing,
-    Image,
-    load,
-    match_and_score,
-    nearest,
-    padded_size,
-    shift_of,
-)
+from mfvpr.localization.query_steps import Described, Describing, Image
 from mfvpr.localization.route import Route
 from mfvpr.storage.cache_files import pack_arrays, unpack_arrays
 from mfvpr.storage.feature_cache import FeatureCache
@@ -60,19 +43,6 @@ from mfvpr.utils.runtime import DEFAULT_RUNTIME, Runtime
 
 _FIRST_ROWS = 1024  # of global descriptors; twice as many whenever they are full
 _ROWS = whole(0, 10**9)  # an argument that is a number of rows
-
-Method = TypeVar("Method", bound=Callable[..., Any])
-
-
-def exclusive(method: Method) -> Method:
-    """Let one thread at a time run a method of a map."""
-
-    @wraps(method)
-    def run(self: "Map", *arguments: Any, **options: Any) -> Any:
-        with self._lock:
-            return method(self, *arguments, **options)
-
-    return run  # pyright: ignore[reportReturnType]  # of the same arguments
 
 
 class Map:
@@ -111,11 +81,12 @@ class Map:
             InputError: a system that a map cannot use, or another one than that of the folder's map; a threshold
                 without a confidence; a new map of a system whose image size follows the images (use `create`).
         """
-        self.system = fit_to_map(Path(folder), system, None, runtime.log)
-        self.extractor, describer = describers_of(self.system)
+        self.system = map_settings.fit_to_map(Path(folder), system, None, runtime.log)
+        self.extractor, describer = map_settings.describers_of(self.system)
         self.folder, self.candidates = Path(folder).absolute(), int(self.system.pipeline.candidates)
         self._runtime, self._file, self._lock = runtime, MapFile(self.folder), threading.RLock()
-        self._parts, self._is_checked = parts_of(self.system), False  # whether the file is known to have these parts
+        self._parts = map_settings.parts_of(self.system)
+        self._is_checked = False  # whether the file is known to have these parts
         self._fitting = describer if isinstance(describer, VladFitting) else None  # of a vocabulary
         self._describing = None if isinstance(describer, VladFitting) else Describing(self.extractor, describer)
         self._images, self._row_of_name = list[tuple[str, Any]](), dict[str, int]()  # (name, place)
@@ -126,10 +97,11 @@ class Map:
         self._noise_scores: dict[int, float] = {}  # by the number of rows
         self._typical = self.extractor.scales[0].typical_count
         self._matcher: Any = self.system.pipeline.matcher  # one that JAX compiles, see `describers_of`
+        self._final = self.system.final_scores[self.system.headline]  # the score that decides
         self.refresh()
         if confidence is None and (part := self._file.part("confidence")):
             content = json.loads(part)
-            if content["system"] != system_fingerprint(self.system):
+            if content["system"] != map_settings.system_fingerprint(self.system):
                 expected = "the confidence of this map's system, got that of another system or version"
                 raise InputError(f"{folder}: expected {expected}; calibrate again")
             confidence = confidence_from_json(content["confidence"])
@@ -145,7 +117,7 @@ class Map:
 
         An InputError if there is no map, or one with a system of your own: use `Map(folder, system)`.
         """
-        return cls(folder, read_system(Path(folder)), threshold=threshold, runtime=runtime)
+        return cls(folder, map_settings.read_system(Path(folder)), threshold=threshold, runtime=runtime)
 
     @classmethod
     def create(
@@ -161,7 +133,7 @@ class Map:
         """Make a map of the images of a folder, or add those that it lacks; see `build` for the arguments."""
         images = images if isinstance(images, ImageFolder) else image_folder(images)
         warn = lambda line: runtime.log(f"warning: {line}")  # noqa: E731
-        known = cls(folder, fit_to_map(Path(folder), system, images, warn), runtime=runtime)
+        known = cls(folder, map_settings.fit_to_map(Path(folder), system, images, warn), runtime=runtime)
         if same := len({*known.names} & {*images.names}):
             fix = "make another map if their content is new"
             runtime.log(f"{folder}: has {same} of {len(images)} images already, by their names, and keeps them; {fix}")
@@ -184,8 +156,8 @@ class Map:
         `ground_truth`, see `mfvpr.datasets.folder`. The cache keeps features.
         """
         dataset = folder_dataset(database, queries, ground_truth=ground_truth)
-        self.confidence, data = fit_on_drive(dataset, self.system, cache)
-        if (of_system := system_fingerprint(self.system)) is None:
+        self.confidence, data = map_settings.fit_on_drive(dataset, self.system, cache)
+        if (of_system := map_settings.system_fingerprint(self.system)) is None:
             warnings.warn("a part of the system names no `recipe`: the confidence is not kept on disk", stacklevel=2)
         else:
             content = {"system": of_system, "queries": len(data.correct), "absent_queries": data.num_absent}
@@ -197,7 +169,6 @@ class Map:
         """Find where an image, a file or `[H, W, 3]` uint8 RGB, was taken; see `localize_with_evidence`."""
         return self.localize_with_evidence(image, recent=recent, route=route).prediction
 
-    @exclusive
     def localize_with_evidence(
         self, image: Image, *, recent: int = 0, before: int | None = None, route: Route | None = None
     ) -> Localization:
@@ -219,31 +190,33 @@ class Map:
         if not isinstance(route, Route | None):
             raise InputError(f"route: expected Route(), the same for all images of a drive, got {route!r}")
         _ROWS.check("recent", recent)
-        (_ROWS | None).check("before", before)
-        self._refresh_images()
-        pixels, total = load(image), len(self)
-        described, resized = self.describing.pixels(pixels)
-        end = max(0, (total if before is None else min(int(before), total)) - int(recent))
-        localized = self._localize(described, end, pixels.shape[1::-1], reason_against_image(resized))
-        if route is None:
-            return localized
-        refusals = REFUSALS if self.confidence is None else self.confidence.refusals
-        located = route(localized.prediction, self.there[:end], refusals)
-        prediction = replace(localized.prediction, located=located)
-        if located is not None and located.row is None:
-            prediction = prediction.without_place("off the map")
-        return localized._replace(prediction=prediction)
+        _ROWS.check("before", 0 if before is None else before)
+        with self._lock:
+            self._refresh_images()
+            pixels, total = query_steps.load(image), len(self)
+            described, resized = self.describing.pixels(pixels)
+            end = max(0, (total if before is None else min(int(before), total)) - int(recent))
+            localized = self._localize(described, end, pixels.shape[1::-1], reason_against_image(resized))
+            if route is None:
+                return localized
+            refusals = REFUSALS if self.confidence is None else self.confidence.refusals
+            located = route(localized.prediction, self.there[:end], refusals)
+            prediction = replace(localized.prediction, located=located)
+            if located is not None and located.row is None:
+                prediction = prediction.without_place("off the map")
+            return localized._replace(prediction=prediction)
 
-    @exclusive
     def warm_up(self) -> None:
         """Compile what `localize` needs for images like those of the map; an InputError for an empty map."""
-        self._refresh_images()
-        self.describing.image(noise_images()[0])
-        rows = {padded_size(count, self._typical): row for row, count in enumerate(self._counts)}  # one of each size
-        images = self._read_features([*rows.values()])
-        for row, features in zip(rows.values(), images, strict=True):  # its own best candidate: nothing is left out
-            match_and_score(features, images, self._matcher, self.system.scorers, self._typical)
-            self._localize((features, self._vectors[row]), len(self), self.extractor.image_size, None)
+        with self._lock:
+            self._refresh_images()
+            self.describing.image(noise_images()[0])
+            # A row of each size; it is its own best candidate, so nothing is left out.
+            rows = {query_steps.padded_size(count, self._typical): row for row, count in enumerate(self._counts)}
+            images = self._read_features([*rows.values()])
+            for row, features in zip(rows.values(), images, strict=True):
+                query_steps.match_and_score(features, images, self._matcher, self.system.scorers, self._typical)
+                self._localize((features, self._vectors[row]), len(self), self.extractor.image_size, None)
 
     def _refresh_images(self) -> None:
         self.refresh()
@@ -255,13 +228,15 @@ class Map:
         features, vector = described
         if end and strength(features) < LEAST_STRENGTH * self._strengths[end] / end:
             reason = "too few features"
-        rows, similarities = nearest(self._vectors[:end], vector, self.candidates)
+        rows, similarities = query_steps.nearest(self._vectors[:end], vector, self.candidates)
         if reason is None and not len(rows):
             reason = "no candidates"
         if reason is not None:
             return Localization(Prediction(reason=reason, image_width=size[0]), described, None)
         candidates = self._read_features(rows.tolist())
-        matches, scores = match_and_score(features, candidates, self._matcher, self.system.scorers, self._typical)
+        matches, scores = query_steps.match_and_score(
+            features, candidates, self._matcher, self.system.scorers, self._typical
+        )
         ranking = self._rank(rows, similarities, scores)
         best = matches[int(np.flatnonzero(rows == ranking.rows[0, 0])[0])]
         if reason := reason_against(best.mask.sum(), evidence_scores(best)[0], self._noise_score(end)):
@@ -271,7 +246,7 @@ class Map:
             Alternative(row, *self._images[row], score=score)
             for row, score in zip(ranking.rows[0].tolist(), ranking.scores[0].tolist(), strict=True)
         )
-        top, shift = alternatives[0], shift_of(self.system.scorers.values(), best, size)
+        top, shift = alternatives[0], query_steps.shift_of(self.system.scorers.values(), best, size)
         confidence = None if math.isnan(p) else p  # without a finite score
         prediction = Prediction(top.place, alternatives, top.score, confidence, *shift, image_width=size[0])
         if self.threshold is not None and not p >= self.threshold:
@@ -285,9 +260,9 @@ class Map:
             scores = [0.0]
             for image in noise_images(self.extractor.image_size):
                 features, vector = self.describing.image(image)
-                rows, _ = nearest(self._vectors[:end], vector, self.candidates)
+                rows, _ = query_steps.nearest(self._vectors[:end], vector, self.candidates)
                 candidates = self._read_features(rows.tolist())
-                pairs, _ = match_and_score(features, candidates, self._matcher, {}, self._typical)
+                pairs, _ = query_steps.match_and_score(features, candidates, self._matcher, {}, self._typical)
                 scores += [float(evidence_scores(pair)[0]) for pair in pairs]
             self._noise_scores[end] = float(np.max(scores))
         return self._noise_scores[end]
@@ -297,8 +272,7 @@ class Map:
         pad = lambda values, fill: np.pad(values, (0, self.candidates - len(values)), constant_values=fill)[None]  # noqa: E731
         shortlist = Shortlist(pad(rows, -1), pad(similarities, 0), pad(np.ones(len(rows), bool), False))
         padded_scores = {name: pad(values, np.nan) for name, values in scores.items()}
-        final = self.system.final_scores[self.system.headline]
-        [ranking] = rank_by_scores(shortlist, padded_scores, [final], self.system.ties).values()
+        [ranking] = rank_by_scores(shortlist, padded_scores, [self._final], self.system.ties).values()
         return Ranked(ranking.rows[:, : len(rows)], ranking.scores[:, : len(rows)])
 
     def __len__(self) -> int:
@@ -330,38 +304,37 @@ class Map:
         """Place of the image in a row."""
         return self._images[row][1]
 
-    @exclusive
     def refresh(self) -> int:
         """Read and count the images that were added since; an InputError for other settings, or a damaged map."""
-        before = len(self)
-        for part, now in () if self._is_checked else self._parts.items():
-            stored = json.loads(self._file.part(part) or b"{}")
-            if differing := " and ".join(name for name in stored if stored[name] != now.get(name)):
-                fix = "Use what it was made with (`mfvpr map info`), or name another folder"
-                raise InputError(f"{self.folder}: this map was made with other {differing}. {fix}.")
-            self._is_checked = bool(stored)  # the last part is in every map
-        if self._describing is None and (content := self._file.part("vocabulary")) is not None:
-            arrays = unpack_arrays(content)
-            self._describing = Describing(self.extractor, Vlad(arrays["centers"], float(arrays["power"])))
-        for entry, count, strength_sum in self._file.entries(before):
-            if len(self) == len(self._vectors):
-                more = np.zeros((max(_FIRST_ROWS, len(self)), len(entry.vector)), np.float32)
-                self._vectors = np.concatenate([self._vectors, more]) if len(self) else more
-            self._vectors[len(self)] = entry.vector if entry.vector.any() else np.nan
-            self._row_of_name[entry.name] = len(self)
-            self._images.append((entry.name, entry.place))
-            self._counts.append(count)
-            self._strengths.append(self._strengths[-1] + strength_sum)
-        return len(self) - before
+        with self._lock:
+            before = len(self)
+            for part, now in () if self._is_checked else self._parts.items():
+                stored = json.loads(self._file.part(part) or b"{}")
+                if differing := " and ".join(name for name in stored if stored[name] != now.get(name)):
+                    fix = "Use what it was made with (`mfvpr map info`), or name another folder"
+                    raise InputError(f"{self.folder}: this map was made with other {differing}. {fix}.")
+                self._is_checked = bool(stored)  # the last part is in every map
+            if self._describing is None and (content := self._file.part("vocabulary")) is not None:
+                arrays = unpack_arrays(content)
+                self._describing = Describing(self.extractor, Vlad(arrays["centers"], float(arrays["power"])))
+            for entry, count, strength_sum in self._file.entries(before):
+                if len(self) == len(self._vectors):
+                    more = np.zeros((max(_FIRST_ROWS, len(self)), len(entry.vector)), np.float32)
+                    self._vectors = np.concatenate([self._vectors, more]) if len(self) else more
+                self._vectors[len(self)] = entry.vector if entry.vector.any() else np.nan
+                self._row_of_name[entry.name] = len(self)
+                self._images.append((entry.name, entry.place))
+                self._counts.append(count)
+                self._strengths.append(self._strengths[-1] + strength_sum)
+            return len(self) - before
 
-    @exclusive
     def learn(self, images: ImageFolder, *, cache: FeatureCache | None = None) -> None:
         """Learn the vocabulary from some images, unless the map has one; arguments and errors are those of `build`."""
-        if self._describing is None:
-            with self._learned(images, cache):
-                pass
+        with self._lock:
+            if self._describing is None:
+                with self._learned(images, cache):
+                    pass
 
-    @exclusive
     def build(
         self, images: ImageFolder, places: Sequence[Any] | None = None, *, cache: FeatureCache | None = None
     ) -> int:
@@ -376,44 +349,45 @@ class Map:
         Raises:
             InputError: an image cannot be read, another process adds, or the disk is full: what was added stays.
         """
-        places = images.names if places is None else places
-        if len(places) != len(images):
-            raise InputError(f"expected a place of each of {len(images)} images, got {len(places)}")
-        place_of = dict(zip(images.names, places, strict=True))
-        for name, place in place_of.items():
-            check_entry(name, place)
-        self.refresh()
-        if {*images.names} <= {*self._row_of_name}:  # also in a map that can only be read
-            return 0
-        with self._learned(images, cache) as cache:
-            before, names = len(self), tuple(name for name in images.names if name not in self._row_of_name)
-            for batch in self.describing.folder(replace(images, names=names), cache):
-                entries = [Entry(names[row], place_of[names[row]], vector) for row, (_, vector) in batch.items()]
-                self._add(entries, [features for features, _ in batch.values()])
-            return len(self) - before
+        with self._lock:
+            places = images.names if places is None else places
+            if len(places) != len(images):
+                raise InputError(f"expected a place of each of {len(images)} images, got {len(places)}")
+            place_of = dict(zip(images.names, places, strict=True))
+            for name, place in place_of.items():
+                check_entry(name, place)
+            self.refresh()
+            if {*images.names} <= {*self._row_of_name}:  # also in a map that can only be read
+                return 0
+            with self._learned(images, cache) as cache:
+                before, names = len(self), tuple(name for name in images.names if name not in self._row_of_name)
+                for batch in self.describing.folder(replace(images, names=names), cache):
+                    entries = [Entry(names[row], place_of[names[row]], vector) for row, (_, vector) in batch.items()]
+                    self._add(entries, [features for features, _ in batch.values()])
+                return len(self) - before
 
-    @exclusive
     def add(self, image: Image, place: Any, *, name: str | None = None) -> None:
         """Add an image and its place, any JSON value; an array needs a name, that of a file is its absolute path.
 
         Errors are those of `build`; also for a name that the map has, and for a map without its vocabulary.
         """
-        if name is None:
-            if not isinstance(image, str | os.PathLike):
-                raise InputError("name: expected one for an image that is no file")
-            name = canonical_name(Path(image))
-        features, vector = self.describing.image(image)
-        self.add_described([Entry(name, place, vector)], [features])
+        with self._lock:
+            if name is None:
+                if not isinstance(image, str | os.PathLike):
+                    raise InputError("name: expected one for an image that is no file")
+                name = canonical_name(Path(image))
+            features, vector = self.describing.image(image)
+            self.add_described([Entry(name, place, vector)], [features])
 
-    @exclusive
     def add_described(self, entries: Sequence[Entry], features: Sequence[Features]) -> None:
         """Add images with features and global descriptors that `describing` has computed; errors are those of `add`."""
-        for name, place, _ in entries:
-            check_entry(name, place)
-        self.describing  # noqa: B018  # raises without a vocabulary
-        with self._file.lock():
-            self.refresh()
-            self._add(entries, features)
+        with self._lock:
+            for name, place, _ in entries:
+                check_entry(name, place)
+            self.describing  # noqa: B018  # raises without a vocabulary
+            with self._file.lock():
+                self.refresh()
+                self._add(entries, features)
 
     def _add(self, entries: Sequence[Entry], features: Sequence[Features]) -> None:
         """Check and add images within the lock."""

@@ -43,10 +43,9 @@ Value = TypeVar("Value")
 
 def states(folder: ImageFolder, rows: Iterable[int] | None = None) -> list[str]:
     """A text for each image, which changes with the file, or with the conversion of its pixels."""
-    how = folder.orient, folder.bits
     names = folder.names if rows is None else [folder.names[row] for row in rows]
     paths = (f"{folder.root}/{image}" for image in names)
-    return [f"{path} {state_of(path)} {how}" for path in paths]
+    return [f"{path} {state_of(path)} {folder.orient} {folder.bits}" for path in paths]
 
 
 @dataclass
@@ -93,17 +92,11 @@ class Recipes:
         return self.of_features(extractor) | {"images": self.contents(folder).fingerprint}
 
 
-@dataclass(frozen=True)
-class Vectors:
-    """Global descriptors of all images of a folder.
+class Vectors(NamedTuple):
+    """Global descriptors of all images of a folder, float32."""
 
-    Attributes:
-        values: float32; NaN for bad images, which no shortlist contains.
-        bad: row -> reason, for images without a usable descriptor.
-    """
-
-    values: Float[np.ndarray, "_ dimensions"]
-    bad: Mapping[int, str]
+    values: Float[np.ndarray, "_ dimensions"]  # NaN for bad images, which no shortlist contains
+    bad: Mapping[int, str]  # row -> reason, for images without a usable descriptor
 
 
 @dataclass
