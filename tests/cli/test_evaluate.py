@@ -122,6 +122,7 @@ def test_demo_ranks_histogram_above_count_above_retrieval_and_leaves_a_run_folde
     recall = {(row["system"], row["tolerance"]): row["recall_at"]["1"] for row in rows}
     for tolerance in (1, 2):  # within 5 frames retrieval alone finds as many as the count
         assert recall["histogram", tolerance] > recall["count", tolerance] > recall["retrieval", tolerance]
+    assert recall["histogram", 5] > recall["count", 5]
     systems = ["retrieval", *PAPER, "histogram_ratio", "histogram + retrieval"]
     _, _, *lines = done.stdout[done.stdout.index("system") :].splitlines()[: 2 + len(systems)]
     assert [line.split("  ")[0] for line in lines] == systems
