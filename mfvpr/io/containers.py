@@ -214,9 +214,6 @@ def _h5py(path: Path) -> Any:
     return h5py
 
 
-# --- names of images -----------------------------------------------------------------------------------------------
-
-
 def match_names(path: Path, names: Sequence[str], foreign: Iterable[str]) -> list[str | None]:
     """Find the name of each image in a file.
 

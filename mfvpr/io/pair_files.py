@@ -1,7 +1,7 @@
 """Files with matches of image pairs: hloc's HDF5, COLMAP's databases, kapture's folders, folders of results.
 
 Results are a file for each pair (`.npz`, vismatch's `.torch`), or a `.torch` file of To-Match beside each text file of
-predictions that VPR-methods-evaluation writes. PyTorch is not needed.
+VPR-methods-evaluation's predictions.
 """
 
 import sqlite3
@@ -76,9 +76,6 @@ def content_paths(path: Path) -> list[Path]:
     return [each.resolve() for each in (kapture_folders(path) if path.is_dir() and is_kapture(path) else [path])]
 
 
-# --- hloc --------------------------------------------------------------------------------------------------------
-
-
 def open_hloc(path: Path) -> PairFiles:
     """hloc's HDF5: a group `IMAGE/IMAGE` for each pair, with `-` for each `/` of the names.
 
@@ -119,8 +116,6 @@ def open_hloc(path: Path) -> PairFiles:
         raise InputError(f"{path}: expected different names of images, got two that differ by - and / alone")
     return PairFiles(path, places, read, by_number, spelling=spelling)
 
-
-# --- COLMAP ------------------------------------------------------------------------------------------------------
 
 _MOST_IMAGES = 2**31 - 1  # the number of a pair is this times the number of the first image plus the other
 
@@ -177,8 +172,6 @@ def _open_database(path: Path) -> Iterator[sqlite3.Connection]:
         yield database
 
 
-# --- kapture -----------------------------------------------------------------------------------------------------
-
 _KAPTURE = Path("reconstruction/matches")
 _NUMBERS = {"float32": "<f4", "float64": "<f8", "float": "<f8"}  # types of keypoints
 
@@ -231,8 +224,6 @@ def open_kapture(path: Path) -> PairFiles:
 
     return PairFiles(path, places, read, keypoints=lambda image: matrix(features / f"{image}.kpt", dtype, width)[:, :2])
 
-
-# --- results -----------------------------------------------------------------------------------------------------
 
 QUERY, PREDICTIONS, POSITIVES = "Query path:", "Predictions paths:", "Positives paths:"  # headings
 _NAMES = ("img0_path", "img1_path")  # vismatch's

@@ -38,7 +38,6 @@ class File:
         object.__setattr__(self, "path", Path(self.path))  # recipes recognize files by this type
 
     def names(self, folder: ImageFolder) -> list[str]:
-        """Names of a folder's images in the file."""
         return [self.prefix + name for name in folder.names]
 
 
