@@ -77,7 +77,7 @@ def test_folders_that_cannot_be_listed_are_errors(tmp_path, monkeypatch):
         return scandir(path)
 
     monkeypatch.setattr(os, "scandir", closed)
-    with pytest.raises(InputError, match="sub: .*Permission denied"):
+    with pytest.raises(InputError, match=r"sub: .*Permission denied"):
         image_folder(root)
 
 
