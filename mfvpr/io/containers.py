@@ -29,10 +29,7 @@ class FileEntry(NamedTuple):
 
 
 class H5File:
-    """An hloc file: images are the groups that hold datasets, named by their relative paths.
-
-    `entries` are the places of the images' arrays by name.
-    """
+    """An hloc file: images are the groups that hold datasets; `entries` are the places of their arrays by name."""
 
     transposed = True  # descriptors are `[D, N]` if their shapes fit both layouts
 

@@ -58,7 +58,7 @@ class PairFiles:
 
 def open_pairs(path: Path, names: tuple[Sequence[str], Sequence[str]], verified: bool = False) -> PairFiles:
     """Matches of the queries and database images `names`; only those that fit a geometric model if `verified`."""
-    if path.is_dir() and has_results(path):
+    if any(file.with_suffix(".txt").exists() for file in path.glob("*.torch")):  # To-Match's, beside predictions
         return open_predictions(path, verified)
     if path.is_dir() and not is_kapture(path):
         return open_results(path, names, verified)
@@ -136,7 +136,7 @@ def open_colmap(path: Path, verified: bool = False) -> PairFiles:
     }
 
     def matrix(table: str, column: str, number: int, dtype: str) -> Num[np.ndarray, "rows columns"]:
-        """The matrix of a row `(rows, cols, data)` of a table, of 2 or more columns; without a row, it is empty."""
+        """The matrix of a row of a table, of 2 or more columns; without a row, it is empty."""
         query = f"SELECT rows, cols, data FROM {table} WHERE {column} = ?"
         with _open_database(path) as database:
             rows, columns, content = database.execute(query, (number,)).fetchone() or (0, 2, b"")
@@ -262,11 +262,6 @@ def open_results(path: Path, names: tuple[Sequence[str], Sequence[str]], verifie
             yield _matches_of(file, result, verified)
 
     return PairFiles(path, places, read, by_number=False, sided=has_names == {False}, in_image_files=False)
-
-
-def has_results(folder: Path) -> bool:
-    """Whether a folder has To-Match's results beside predictions."""
-    return any(file.with_suffix(".txt").exists() for file in folder.glob("*.torch"))
 
 
 def open_predictions(path: Path, verified: bool = False) -> PairFiles:
