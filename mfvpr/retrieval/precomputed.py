@@ -79,7 +79,6 @@ class DescriptorFiles(_FolderFiles):
     def shortlist(
         self, sequence: QuerySequence, database: ImageFolder, num_candidates: int, cache: FeatureCache
     ) -> RetrievalResult:
-        """See `Retriever`."""
         database_vectors = cache.once("vectors", lambda: self._read(database), database, self)
         search = cache.once("search", lambda: self.search.fit(database_vectors), database, self)
         query_vectors = self._read(sequence.images)
@@ -157,7 +156,6 @@ class MatchFiles:
         return "images"
 
     def open(self, queries: ImageFolder, database: ImageFolder) -> ImportedMatches:
-        """See `mfvpr.matchers.host_matcher.PairSource`."""
         file = _file_of(self.files, queries)
         known: ImageOfEntry = {}  # images of the entries of both folders
         sides = self._images(queries, file.prefix, known), self._images(database, self.database_prefix, known)

@@ -32,8 +32,7 @@ class ExactSearch:
     Of equal descriptors in different blocks of 65,536 database rows, any may come first: last bits depend on the block.
     """
 
-    def fit(self, database: Database) -> "ExactSearch":
-        """Return itself: there is nothing to learn."""
+    def fit(self, database: Database) -> "ExactSearch":  # there is nothing to learn
         return self
 
     def shortlist(
@@ -91,7 +90,6 @@ class WhitenedSearch:
     def shortlist(
         self, queries: Queries, database: Database, num_candidates: int, *, excluded: Positives | None = None
     ) -> Shortlist:
-        """As `ExactSearch.shortlist`."""
         learned = self.whitening or self.fit(database).whitening
         assert learned is not None
         whiten = partial(_project, mean=learned.mean, components=learned.components)
