@@ -115,7 +115,8 @@ def nordland_27592(root: Path, seasons: tuple[str, str]) -> Content:
         listed = root / f"nordland_imageNames_{side}.txt"
         if listed.exists():  # its names begin with other folders
             with reading(listed, "a list"):
-                names = [PurePosixPath(line).name for line in np.loadtxt(listed, str, ndmin=1).tolist()]
+                lines = map(str.strip, listed.read_text(encoding="utf-8-sig").splitlines())
+            names = [PurePosixPath(line).name for line in lines if line]
             folders.append(listed_images(root / season, names, listed))
         else:
             folders.append(image_folder(root / season))
@@ -157,11 +158,11 @@ def robotcar_seasons(root: Path) -> Dataset:
     """
     path = root / "robotcar_v2_train.txt"
     with reading(path, "a list", "expected lines of a name and the 16 numbers of a pose by rows, the last 0 0 0 1"):
-        lines = np.loadtxt(path, str, ndmin=2)
-        poses = lines[:, 1:].astype(np.float64).reshape(len(lines), 4, 4)
+        lines = [words for line in path.read_text(encoding="utf-8-sig").splitlines() if (words := line.split())]
+        poses = np.array([words[1:] for words in lines], np.float64).reshape(len(lines), 4, 4)
         if not np.allclose(poses[:, 3], (0, 0, 0, 1), rtol=0, atol=1e-6) or not (np.abs(poses) <= FARTHEST).all():
             raise ValueError("numbers that are no pose")
-    images = (PurePosixPath(name).with_suffix(".jpg").as_posix() for name in lines[:, 0].tolist())
+    images = (PurePosixPath(name).with_suffix(".jpg").as_posix() for name, *_ in lines)
     centers: dict[str, np.ndarray] = {}
     for image, center in zip(images, poses[:, :3, 3], strict=True):
         if not np.array_equal(centers.setdefault(image, center), center):
