@@ -11,7 +11,6 @@ from experiments.paper.pages import write_pages
 from experiments.paper.systems import LeftOut, Place, Row
 from experiments.paper.tables import Evaluations, paper_tables, recalls_of
 from mfvpr.checkpoints import how_to_install
-from mfvpr.cli import jobs
 from mfvpr.cli.console import tell
 from mfvpr.cli.jobs import cache_of, dataset_of, describe_truth
 from mfvpr.cli.schema import Paper
@@ -19,6 +18,7 @@ from mfvpr.datasets import Dataset
 from mfvpr.datasets.published import published_differences
 from mfvpr.evaluation.rankings import RETRIEVAL
 from mfvpr.report import write_json, write_table
+from mfvpr.report.pages import write_report
 from mfvpr.report.rendering import PAGE
 from mfvpr.report.runs import LAST
 from mfvpr.utils.errors import InputError
@@ -118,7 +118,7 @@ def evaluate_all(
                     continue
             finished[place.name, run] = folder
             if not (folder / PAGE).is_file():
-                jobs.report_page(folder)
+                write_report(folder)
     return datasets, finished, failures
 
 

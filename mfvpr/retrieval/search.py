@@ -29,12 +29,10 @@ Database = Float[np.ndarray, "database dimensions"]
 class ExactSearch:
     """Search for the largest dot products in chunks that fit into memory, with the result of `retrieve`.
 
-    Above 65,536 database rows, the last bits of scores depend on the block of 65,536 rows: of equal descriptors in
-    different blocks, any may come first. On a CPU, no bit depends on the free memory.
+    Of equal descriptors in different blocks of 65,536 database rows, any may come first: last bits depend on the block.
     """
 
-    def fit(self, database: Database) -> "ExactSearch":
-        """Return itself: there is nothing to learn."""
+    def fit(self, database: Database) -> "ExactSearch":  # there is nothing to learn
         return self
 
     def shortlist(
@@ -71,18 +69,13 @@ EXACT = ExactSearch()
 
 @dataclass(frozen=True)
 class WhitenedSearch:
-    """Search by whitened descriptors: principal components with unit variance, scaled to unit length.
+    """Search by whitened descriptors: principal components of the database (Jegou & Chum, ECCV 2012).
 
-    See Jegou & Chum, ECCV 2012. The components are those of the database: queries lose directions in which the database
-    does not vary.
-
-    Attributes:
-        dimension: D', number of components.
-        whitening: the learned components; None = `shortlist` learns them from the database.
+    Components have unit variance; together they are scaled to unit length.
     """
 
-    dimension: int
-    whitening: Whitening | None = None
+    dimension: int  # D', number of components
+    whitening: Whitening | None = None  # the learned components; None = `shortlist` learns them from the database
 
     def fit(self, database: Database) -> "WhitenedSearch":
         """Search with the principal components of a database; itself if they were learned."""
@@ -97,7 +90,6 @@ class WhitenedSearch:
     def shortlist(
         self, queries: Queries, database: Database, num_candidates: int, *, excluded: Positives | None = None
     ) -> Shortlist:
-        """As `ExactSearch.shortlist`."""
         learned = self.whitening or self.fit(database).whitening
         assert learned is not None
         whiten = partial(_project, mean=learned.mean, components=learned.components)
@@ -147,16 +139,15 @@ def retrieve(
         shortlist = mfvpr.retrieve(query_descriptors, database_descriptors, num_candidates=50)
 
     Args:
-        query_descriptors: unit length.
-        database_descriptors: unit length. For several calls, put them on the device once (`jax.device_put`): with
-            NumPy's arrays every call copies them.
+        query_descriptors, database_descriptors: unit length. For several calls, put the database on the device once
+            (`jax.device_put`): NumPy's arrays are copied at every call.
         num_candidates: if there are fewer database images, the shortlist ends in -1.
         mask: False for database images that must not appear (for that query); another shape raises an `InputError`.
 
     Returns:
         Shortlist by descending cosine similarity; the first row wins a tie. A database image with a descriptor
-        that is not finite never appears; a query with a descriptor that is not finite has an empty shortlist. On a CPU
-        the scores of a query do not depend on the other queries, in any bit.
+        that is not finite never appears; a query with one has an empty shortlist. On a CPU the scores of a query do
+        not depend on the other queries, in any bit.
     """
     shapes = [(len(database_descriptors),), (len(query_descriptors), len(database_descriptors))]
     if mask is not None and mask.shape not in shapes:

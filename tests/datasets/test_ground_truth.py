@@ -8,15 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from mfvpr import InputError, datasets
-from mfvpr.datasets import (
-    AllowedTruth,
-    FrameTruth,
-    IndexFile,
-    LabelFiles,
-    LabelTruth,
-    Positives,
-    RadiusTruth,
-)
+from mfvpr.datasets import AllowedTruth, FrameTruth, IndexFile, LabelFiles, Positives, RadiusTruth
 from mfvpr.datasets.ground_truth import threshold_words
 from mfvpr.utils.files import write_text
 from tests import oracles
@@ -130,16 +122,6 @@ def test_a_name_in_two_folders_needs_its_path(tmp_path):
     np.testing.assert_array_equal(truth.positives(0).dense(), np.eye(2, dtype=bool))
 
 
-def test_many_labels_are_a_loop_over_all_pairs():
-    rng = np.random.default_rng(0)
-    truth = LabelTruth(rng.integers(-1, 60, 2000), rng.integers(-1, 60, 3000))
-    positives = truth.positives(0)
-    for query in (0, 7, 1999):
-        is_correct = (truth.database_labels == truth.query_labels[query]) & (truth.query_labels[query] >= 0)
-        np.testing.assert_array_equal(positives.of(query), np.flatnonzero(is_correct))
-        np.testing.assert_array_equal(np.isfinite(truth.distance(query)), is_correct)
-
-
 @given(st.integers(0, 2**32 - 1), st.sampled_from([0.0, 3.0, 25.0, 1e6]))
 def test_a_radius_is_a_loop_over_all_pairs(seed, radius):
     rng = np.random.default_rng(seed)
@@ -160,13 +142,13 @@ def test_frames_are_a_loop_over_all_pairs(tolerance):
 
 def test_excluded_images_are_not_correct():
     excluded = np.array([[False, True, True, False], [True, False, False, False]])
-    truth = AllowedTruth(FrameTruth(((1,), (0,)), 4), Positives.from_matrix(excluded))
+    truth = AllowedTruth(FrameTruth(((1,), (0,)), 4), Positives(excluded))
     np.testing.assert_array_equal(truth.positives(1).dense(), [[True] + [False] * 3, [False, True, False, False]])
     np.testing.assert_array_equal(truth.shows_place(1).dense(), [[True] * 3 + [False], [True, True, False, False]])
     assert not truth.positives(0).rows.size
     np.testing.assert_array_equal(truth.shows_place(0).dense(), excluded)  # more than the tolerance alone
     assert (truth.place(0), truth.place(1), truth.unit) == (0, 1, "frames")
-    assert AllowedTruth(truth, Positives.from_matrix(np.ones_like(excluded))).place(0) is None
+    assert AllowedTruth(truth, Positives(np.ones_like(excluded))).place(0) is None
 
 
 @pytest.mark.parametrize(
