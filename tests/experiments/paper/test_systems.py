@@ -177,7 +177,7 @@ def test_tables_hold_both_numbers():
         f"pitts30k_val (incomplete) ±25 R@{k}" for k in (1, 5, 10)
     ]
     assert tables["depths"].header[1:] == depths
-    assert tables["depths"].rows[0][1:4] == ["92.5", "95.0", "99.0"]
+    assert tables["depths"].rows[0][1:4] == ["92.5 (92.0, +0.5)", "95.0", "99.0"]
     printed = printed_tables()["pitts30k"][MIX.name]
     assert [cell.partition(",")[0] for cell in tables["depths"].rows[0][4:]] == [
         f"{ours} ({theirs}" for ours, theirs in zip((80.0, 90.0, 91.0), printed, strict=True)
