@@ -6,9 +6,8 @@ from urllib.parse import quote
 
 from experiments.paper.tables import Evaluations, average, printed_tables
 from mfvpr.report import Table
-from mfvpr.report.pages import write_comparison
+from mfvpr.report.pages import PAGE, Section, embed, values_table, write_comparison, write_page
 from mfvpr.report.plots import panels, save_figure
-from mfvpr.report.rendering import PAGE, Section, embed, values_table, write_page
 from mfvpr.utils.fingerprints import versions
 
 _COSTS, _ABOUT = ("sizes", "seconds"), ("data_sets", "settings")  # names of tables
@@ -69,7 +68,7 @@ def write_pages(
         about["Left out"] = Table(["what", "why"], [line.split(": ", 1) for line in left_out], text_columns=2)
     about["Versions"] = values_table(versions())
     figure = out / "figures" / "averages.png"
-    averages = {"Mean recall at 1 within 2 frames": embed(figure)} if figure.exists() else {}
+    averages = {"Mean recall at 1 within 2 frames": embed(figure.read_bytes())} if figure.exists() else {}
     words = "In %. Where the paper prints a number, that and the difference stand beside ours."
     links_words = "Their own pages, and all of a data set side by side, with tests and intervals."
     sections = [

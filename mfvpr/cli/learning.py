@@ -18,7 +18,7 @@ from mfvpr.cli.sweeping import axes_of
 from mfvpr.datasets.contents import Contents, fingerprints, own_rows, readings
 from mfvpr.evaluation.protocol import Split
 from mfvpr.matchers import Scales
-from mfvpr.report import comparisons, runs
+from mfvpr.report import runs, searches
 from mfvpr.report.run_files import matched_content
 from mfvpr.systems.assembly import without
 from mfvpr.tuning.learning.comparison import compare
@@ -73,26 +73,26 @@ def learn(settings: Learn) -> None:
             matched, runtime = (data.protocol, data.match_set, data.candidates), cache_of(settings).runtime
             comparison = compare(axes, *matched, options, checkpoints=checkpoints, runtime=runtime)
         heading = _heading(settings, data, teach, report)
-        text = f"{heading}\n\n{comparisons.comparison_text(comparison)}"
+        text = f"{heading}\n\n{searches.comparison_text(comparison)}"
         left_out = ("dataset", "cache", "out", "checkpoints", "cluster", "compiled")
         about = {"data_sets": [each.about for each in teach], "reported_sets": [each.about for each in report]}
         results = {
             **(about if report else teach[0].about),
-            **comparisons.comparison_json(comparison),
+            **searches.comparison_json(comparison),
             "settings": without(to_values(settings), *left_out),
             "seconds": watch.seconds,
             "versions": versions(),
         }
 
         def write(new: Path) -> None:
-            runs.write_table(new, comparisons.comparison_table(comparison), heading)
+            runs.write_table(new, searches.comparison_table(comparison), heading)
             runs.write_json(new / "results.json", results)
             origin = {"command": settings.command, "commit": runs.commit(Path())}
             origin |= without(results, "rows", "queries", "seconds")
-            comparisons.write_weights(new / "weights", comparison, origin)
+            searches.write_weights(new / "weights", comparison, origin)
             write_text(new / "summary.txt", f"{text}\n")
 
-        figures = comparisons.comparison_figures(comparison)
+        figures = searches.comparison_figures(comparison)
         by_name = {each.part.name: each.about["ground_truth"] for each in report}
         ground_truth = by_name if report else teach[0].about["ground_truth"]
         jobs.write_results(folder, settings, ground_truth, text=text, write=write, figures=figures)

@@ -1,8 +1,15 @@
-"""Pages of run folders, read from their files: of one run, of a search or a multirun, of several runs compared."""
+"""Pages of run folders, read from their files: of one run, of a search or a multirun, of several runs compared.
+
+A page is one HTML file that needs no network. Names of images may be anything: they are data, and all is escaped.
+"""
 
 import itertools
 import json
+from base64 import b64encode
 from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from hashlib import sha256
+from io import BytesIO
 from pathlib import Path
 from typing import Any
 
@@ -11,36 +18,96 @@ from jaxtyping import Bool
 
 from mfvpr.datasets.datasets import MEANS
 from mfvpr.datasets.ground_truth import middle, threshold_words
+from mfvpr.datasets.image_reading import open_image
 from mfvpr.evaluation.confidence import PrecisionRecall
 from mfvpr.evaluation.rankings import RETRIEVAL
 from mfvpr.evaluation.statistics import Estimate, estimate, mcnemar, path_test
 from mfvpr.io.containers import reading
 from mfvpr.report.evaluations import sequence_folder
-from mfvpr.report.rendering import (
-    PAGE,
-    Chart,
-    Section,
-    bar_chart,
-    embed,
-    flat,
-    line_chart,
-    pictures,
-    values_table,
-    write_page,
-)
+from mfvpr.report.figures import ABOUT
 from mfvpr.report.runs import LAST, file_names
 from mfvpr.report.tables import Table, format_estimate, format_interval, read_csv, read_table, table_of
 from mfvpr.utils.errors import InputError
+from mfvpr.utils.files import require_replaceable, write_text
 
+# Jinja2 and plotly are imported where they are needed: the rest of the library does not depend on them.
+PAGE = "report.html"  # in a run folder
 MOST_PREDICTIONS = 5000  # rows of a table that a browser still sorts at once
+_MOST_PICTURES = 60
+_PICTURE_WIDTH, _QUALITY = 1000, 75  # px, of JPEG: some 60 kB each
+_POLICY = b"default-src 'none'; script-src "  # at the start of every page
+_TEMPLATES = Path(__file__).parent / "templates"
 _EXPECTED = "expected the run folder of an evaluation of this version"
 _NAMELESS = "folder"  # the default name of a data set of own folders
 _CURVE_POINTS = 200
 _POOLED = MEANS[-1]
-_WITH_TRUTH, _OF_SOME = ("table", "confidence", "precision_recall"), ("changes", "skipped")  # tables
 _OUTCOMES = {"1": "correct", "0": "incorrect", "": "best"}  # by `correct` of predictions
 _SEARCH_TABLES = {"rows": "All scores", "axes": "All settings", "jobs": "All jobs"}  # by a name in results.json
 _IN_TABLES = {"settings", "rows", "queries", "report", "jobs"}  # names in results.json
+
+
+@dataclass(frozen=True)
+class Section:
+    """A part of a page; `name` is a word for its element, `words` stand above everything in it."""
+
+    name: str
+    title: str
+    words: str = ""
+    charts: Sequence[Mapping[str, Any]] = ()  # drawn by script.js
+    tables: Mapping[str, Table] = field(default_factory=dict)  # by caption
+    links: Sequence[tuple[str, str]] = ()  # words, and relative addresses of other pages
+    text: str = ""  # keeps its lines
+    images: Mapping[str, str] = field(default_factory=dict)  # `data:` URIs by title
+    pictures: Sequence[Mapping[str, Any]] = ()  # see `Run.pictures`; they can be filtered, as `predictions` can
+    predictions: Sequence[Mapping[str, str]] = ()  # see `Run.predictions`
+
+
+def write_page(path: Path, *, title: str, words: str, facts: Mapping[str, str], sections: Sequence[Section]) -> None:
+    """Write one HTML file; the same bytes for the same values.
+
+    `words` stand below the title; `facts` are the most important values, by name. An earlier page is replaced; an
+    InputError for other files.
+    """
+    require_replaceable(path, _POLICY)
+    from jinja2 import Environment, FileSystemLoader, StrictUndefined
+    from markupsafe import Markup
+    from plotly.offline import get_plotlyjs
+
+    environment = Environment(loader=FileSystemLoader(_TEMPLATES), autoescape=True, undefined=StrictUndefined)
+    environment.trim_blocks = environment.lstrip_blocks = True
+    environment.policies["json.dumps_kwargs"] = {"sort_keys": True, "allow_nan": False}
+    scripts = [get_plotlyjs(), (_TEMPLATES / "script.js").read_text("utf-8")]
+    hashes = [b64encode(sha256(script.encode()).digest()).decode() for script in scripts]
+    text = environment.get_template("page.html").render(
+        title=title,
+        words=words,
+        facts=facts,
+        sections=sections,
+        charts={chart["name"]: chart for section in sections for chart in section.charts},
+        scripts=map(Markup, scripts),  # of this package and of plotly, as is the style
+        style=Markup((_TEMPLATES / "style.css").read_text("utf-8")),
+        hashes=" ".join(f"'sha256-{each}'" for each in hashes),
+    )
+    write_text(path, text)
+
+
+def values_table(values: Mapping[str, Any]) -> Table:
+    """Nested values by their dotted names."""
+    return Table(["name", "value"], [[*pair] for pair in flat(values)], text_columns=2)
+
+
+def flat(values: Mapping[str, Any]) -> Iterator[tuple[str, str]]:
+    """Nested values as (dotted name, text)."""
+    for name, value in values.items():
+        if isinstance(value, Mapping) and value:
+            yield from ((f"{name}.{inner}", text) for inner, text in flat(value))
+        else:
+            yield name, value if isinstance(value, str) else json.dumps(value, ensure_ascii=False)
+
+
+def embed(content: bytes, kind: str = "png") -> str:
+    """The content of an image file as a `data:` URI."""
+    return f"data:image/{kind};base64,{b64encode(content).decode()}"
 
 
 class Run:
@@ -75,8 +142,8 @@ class Run:
             self.parts = {name: number for number, name in enumerate(self.sequences)} | {_POOLED: None}
             self.thresholds: list[float] = truth.get("thresholds", [])
             self.within = threshold_words(truth["unit"], middle(self.thresholds)) if self.thresholds else ""
-            names = [*_WITH_TRUTH] if self.thresholds else []
-            names += [name for name in _OF_SOME if (folder / f"{name}.csv").exists()]
+            names = ["table", "confidence", "precision_recall"] if self.thresholds else []
+            names += ["skipped"] if (folder / "skipped.csv").exists() else []
             self.tables = {name: read_table(folder / f"{name}.csv") for name in names}
             lines = list[tuple[int, dict[str, str]]]()
             for number in range(len(self.sequences) if self.thresholds else 0):
@@ -93,9 +160,9 @@ class Run:
         hits = (self.ranks[system] > 0) & (self.ranks[system] <= k)
         return hits if sequence is None else hits[self.sequence_of == sequence]
 
-    def recall(self, system: str, sequence: int | None = None) -> Estimate:
-        """Recall at 1 and its 95 % interval."""
-        return estimate(self.hits(system, 1, sequence))
+    def recall(self, system: str, part: str = _POOLED) -> Estimate:
+        """Recall at 1 of a part, and its 95 % interval."""
+        return estimate(self.hits(system, 1, self.parts[part]))
 
     def predictions(self) -> Iterator[dict[str, str]]:
         """The first candidates of all systems for each query that has one, those of the system that decides first.
@@ -113,6 +180,21 @@ class Run:
                     outcome, rank = _OUTCOMES[row["correct"]], ranks.get(row["query"], "")
                     about = {"system": system, "sequence": sequence, "outcome": outcome, "first_correct": rank}
                     yield {"query": row["query"], "prediction": row["database"], "score": row["score"], **about}
+
+    def pictures(self) -> list[dict[str, Any]]:
+        """Figures of queries and their predictions, by their files; evenly chosen if there are many.
+
+        A picture has the values of the keywords `ABOUT`, its `source` as a `data:` URI, and its `size`, px.
+        """
+        paths, shown = sorted((self.folder / "figures").rglob("*_[0-9]*.png")), list[dict[str, Any]]()
+        for path in paths[:: max(1, -(-len(paths) // _MOST_PICTURES))]:
+            with open_image(path) as image:
+                image.load()
+                about, small, file = {name: str(image.info[name]) for name in ABOUT}, image.convert("RGB"), BytesIO()
+            small.thumbnail((_PICTURE_WIDTH, small.height))
+            small.save(file, "JPEG", quality=_QUALITY, optimize=True)
+            shown.append(about | {"source": embed(file.getvalue(), "jpeg"), "size": small.size})
+        return shown
 
 
 def _read_json(path: Path) -> Any:
@@ -133,10 +215,6 @@ def write_report(folder: Path, path: Path | None = None) -> Path:
         sections += _recall_sections({"": run}, {name: (run, name) for name in run.systems})
         for name in (run.headline, RETRIEVAL):
             facts[f"{name}, R@1{run.within}, %"] = format_estimate(run.recall(name))
-    if "changes" in run.tables:
-        words = "First predictions that the other queries of a drive change."
-        changes = Table(run.tables["changes"].header, run.tables["changes"].rows, text_columns=7)
-        sections.append(Section("sequence", "Sequences", words, tables={"Changed predictions": changes}))
     facts["seconds in all"] = f"{sum(run.common['seconds'].values()):.1f}"
     sections += [_predictions_section(run), _settings_section(run)]
     title, dataset = run.common["dataset"], run.about["settings"]["dataset"]
@@ -158,14 +236,14 @@ def write_comparison(folders: Sequence[Path], path: Path) -> None:
     runs = dict(zip(labels, map(Run, folders), strict=True))
     overview, facts, settings = [], {}, {}
     for label, run in runs.items():
-        overview.append({"run": label, "data set": run.common["dataset"], "decides": run.headline})
-        overview[-1]["what was evaluated"] = run.description
+        overview.append([label, run.common["dataset"], run.headline, run.description])
         if run.queries:
             facts[f"{label}, R@1{run.within}, %"] = format_estimate(run.recall(run.headline))
         about = {name: run.about.get(name) for name in ("command", "commit", "settings", "ground_truth")}
         about |= {name: run.common[name] for name in ("data_fingerprint", "versions", "seconds")}
         settings[label] = dict(flat(about))
-    sections = [Section("runs", "Runs", tables={"Runs": table_of(overview, [*overview[0]])})]
+    header = ["run", "data set", "decides", "what was evaluated"]
+    sections = [Section("runs", "Runs", tables={"Runs": Table(header, overview, text_columns=4)})]
     if known := {label: run for label, run in runs.items() if run.queries}:
         curves = {f"{label}: {run.headline}": (run, run.headline) for label, run in known.items()}
         sections += _recall_sections(known, curves)
@@ -184,7 +262,7 @@ def _write_search_page(folder: Path, results: Mapping[str, Any], path: Path) -> 
         [caption] = [caption for name, caption in _SEARCH_TABLES.items() if name in results]
         heading = (folder / "table.md").read_text("utf-8").splitlines()[0]
         summary = (folder / "summary.txt").read_text("utf-8") if (folder / "summary.txt").exists() else ""
-        figures = {file.stem: embed(file) for file in sorted((folder / "figures").glob("*.png"))}
+        figures = {file.stem: embed(file.read_bytes()) for file in sorted((folder / "figures").glob("*.png"))}
         tables = {caption: read_table(folder / "table.csv")}
     about = values_table({name: value for name, value in results.items() if name not in _IN_TABLES})
     title, _, words = heading.partition(": ")
@@ -201,6 +279,15 @@ def _write_search_page(folder: Path, results: Mapping[str, Any], path: Path) -> 
 Curves = Mapping[str, tuple[Run, str]]  # a run and one of its systems, by the name of their curve
 
 
+def _chart(kind: str, name: str, title: str, axes: tuple[str, str], scale: str, data: Mapping[str, Any]) -> list[Any]:
+    """A chart for script.js, if there is something to draw: "lines" of points (x, y in %), or "bars" with intervals.
+
+    `data` are by the name of the curve, or of the group of bars; `axes` are words of x and y, `scale` is that of x.
+    """
+    chart = {"kind": kind, "name": name, "title": title, "axes": axes, "scale": scale, "data": [*data.items()]}
+    return [chart] if data else []
+
+
 def _recall_sections(runs: Mapping[str, Run], curves: Curves) -> list[Section]:
     """Recall of all systems of runs by name; of the curves with intervals, charts, and tests of every two."""
     rows, tables = list[dict[str, str]](), dict[str, Table]()
@@ -209,20 +296,24 @@ def _recall_sections(runs: Mapping[str, Run], curves: Curves) -> list[Section]:
         for cells in run.tables["table"].rows:
             row = dict(zip(run.tables["table"].header, cells, strict=True))
             if (sequence := row.get("sequence", _POOLED)) in run.parts:  # the plain mean has no interval
-                row[f"R@1{run.within}, 95 %"] = format_interval(run.recall(row["system"], run.parts[sequence]).interval)
+                row[f"R@1{run.within}, 95 %"] = format_interval(run.recall(row["system"], sequence).interval)
             rows.append({"run": label} | row if label else row)
         if run.tables["confidence"].rows:
             tables["Confidence of top predictions, in %" + f": {label}" * bool(label)] = run.tables["confidence"]
         if len(run.sequences) > 1 and len(runs) == 1:
-            groups = {name: {part: run.recall(name, run.parts[part]) for part in run.parts} for name in curves}
-    bars = bar_chart("intervals", "Recall at 1, with intervals", groups, axis="recall at 1, %")
-    words = "In %, at the middle tolerance. The 95 % intervals are wider if neighboring queries fail together."
+            groups = {name: {part: run.recall(name, part) for part in run.parts} for name in curves}
+    bars = {
+        name: [(member, 100 * bar.recall, [100 * end for end in bar.interval]) for member, bar in group.items()]
+        for name, group in groups.items()
+    }
+    axes, words = ("recall at 1, %", ""), "In %, at the middle tolerance. "
+    words += "The 95 % intervals are wider if neighboring queries fail together."
+    charts = _chart("bars", "intervals", "Recall at 1, with intervals", axes, "share", bars)
+    charts += _tolerance_chart(curves) + _depths_chart(curves)
     recall = {"Recall of every system": table_of(rows, ("run", "system", "sequence"))}
-    charts = [bars, *_tolerance_chart(curves), _depths_chart(curves)]
-    precision = _precision_charts(curves, "score") + _precision_charts(curves, "confidence")
-    about = (
-        "AP: average precision. R@100P: recall at 100 % precision. ECE: expected calibration error of the confidence."
-    )
+    precision = _precision_chart(curves, "score") + _precision_chart(curves, "confidence")
+    about = "AP: average precision. R@100P: recall at 100 % precision. ECE: expected calibration error of the "
+    about += "confidence."
     return [
         Section("recall", "Recall", words, charts, recall),
         _pairs_section(curves),
@@ -230,19 +321,18 @@ def _recall_sections(runs: Mapping[str, Run], curves: Curves) -> list[Section]:
     ]
 
 
-def _depths_chart(curves: Curves) -> Chart:
+def _depths_chart(curves: Curves) -> list[Any]:
     """Recall at K from 1 to all candidates, at all small Ks and some larger ones."""
     points = {}
     for name, (run, system) in curves.items():
         largest = max(run.common["candidates"], 1)
         depths = np.unique(np.geomspace(1, largest, _CURVE_POINTS).round().astype(int)).tolist()
         points[name] = [(k, 100 * float(run.hits(system, k).mean())) for k in depths]
-    return line_chart(
-        "depths", "Recall over K", points, axes=("K, the first candidates", "recall at K, %"), scale="log"
-    )
+    axes = "K, the first candidates", "recall at K, %"
+    return _chart("lines", "depths", "Recall over K", axes, "log", points)
 
 
-def _tolerance_chart(curves: Curves) -> list[Chart]:
+def _tolerance_chart(curves: Curves) -> list[Any]:
     """Recall of all queries over the threshold, of the runs with several thresholds in the unit of the first."""
     points, (run, _) = dict[str, list[tuple[float, float]]](), next(iter(curves.values()))
     unit, k = run.common["ground_truth"]["unit"], min(run.common["recall_at"], key=int)
@@ -252,10 +342,10 @@ def _tolerance_chart(curves: Curves) -> list[Chart]:
             recalls = [row["recall_at"][k] for row in rows if row.get("sequence", _POOLED) == _POOLED]
             points[name] = [(at, 100 * recall) for at, recall in zip(run.thresholds, recalls, strict=True)]
     axes = f"tolerance, {unit}", f"recall at {k}, %"
-    return [line_chart("tolerances", "Recall over tolerance", points, axes=axes, scale="linear")] if points else []
+    return _chart("lines", "tolerances", "Recall over tolerance", axes, "linear", points)
 
 
-def _precision_charts(curves: Curves, by: str) -> list[Chart]:
+def _precision_chart(curves: Curves, by: str) -> list[Any]:
     """Precision against recall, if the runs have them; names of curves have their average precision."""
     points = {}
     for name, (run, system) in curves.items():
@@ -266,8 +356,7 @@ def _precision_charts(curves: Curves, by: str) -> list[Chart]:
             pairs = np.stack([curve.recall, curve.precision], axis=1)[shown]
             points[f"{name}: AP {100 * curve.average_precision:.1f}"] = (100 * pairs).round(3).tolist()
     axes = "recall of queries with a correct image, %", "precision, %"
-    title = f"Precision and recall by {by}"
-    return [line_chart(f"precision-{by}", title, points, axes=axes, scale="percent")] if points else []
+    return _chart("lines", f"precision-{by}", f"Precision and recall by {by}", axes, "percent", points)
 
 
 def _pairs_section(curves: Curves) -> Section:
@@ -307,12 +396,12 @@ def _incomparable_reason(first: Run, second: Run) -> str | None:
 
 def _predictions_section(run: Run) -> Section:
     with reading(run.folder / LAST, mend=_EXPECTED):
-        images, predictions = pictures(run.folder), [*itertools.islice(run.predictions(), MOST_PREDICTIONS + 1)]
+        pictures, predictions = run.pictures(), [*itertools.islice(run.predictions(), MOST_PREDICTIONS + 1)]
     words = "Query and top prediction with their heaviest matches, and the histogram of their shifts. An incorrect "
     words += "prediction has the correct image below it. The table has the queries without a picture, too."
     if len(predictions) > MOST_PREDICTIONS:
         words += f" It has the first {MOST_PREDICTIONS}; the others are in the folder `predictions` of the run."
-    return Section("predictions", "Predictions", words, pictures=images, predictions=predictions[:MOST_PREDICTIONS])
+    return Section("predictions", "Predictions", words, pictures=pictures, predictions=predictions[:MOST_PREDICTIONS])
 
 
 def _settings_section(run: Run) -> Section:

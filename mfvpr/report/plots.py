@@ -10,9 +10,6 @@ from matplotlib.figure import Figure
 
 from mfvpr.utils.files import replacing, require_replaceable
 
-COLORS = ("#0b84c6", "#e1701a", "#1a9e6f", "#c9559d", "#9a7bd0", "#b58900", "#d1495b", "#5f9ea0")  # on dark and light
-_FIRST = "#8a8f98"  # of what all others are compared with
-_DASHES = ("solid", "dash", "dot", "dashdot")  # told apart without colors, too
 PALE, MARK = "#2fa8ff", "#e8482c"
 _SOFTWARE = b"mfvpr.report"  # at the start of every PNG file
 
@@ -41,10 +38,3 @@ def save_figure(figure: Figure, path: Path, *, dpi: int = 110, **options: Any) -
     with replacing(path) as temporary, warnings.catch_warnings():
         warnings.filterwarnings("ignore", message="Glyph .* missing")  # names in scripts that the font lacks
         figure.savefig(temporary, dpi=dpi, **options)
-
-
-def color_and_dash(place: int) -> tuple[str, str]:
-    """Color and plotly's name of the dash of the system at a place of the table."""
-    if place == 0:
-        return _FIRST, "solid"
-    return COLORS[(place - 1) % len(COLORS)], _DASHES[(place - 1) // len(COLORS) % len(_DASHES)]

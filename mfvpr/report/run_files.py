@@ -14,7 +14,6 @@ from mfvpr.datasets.positives import stack_positives
 from mfvpr.datasets.published import published_differences
 from mfvpr.evaluation.confidence import write_confidences
 from mfvpr.evaluation.dataset_ranking import num_candidates
-from mfvpr.evaluation.drives import DriveFilter
 from mfvpr.evaluation.protocol import places_along_path
 from mfvpr.evaluation.rankings import Fusion, Ranked
 from mfvpr.evaluation.stages import Scales, dominant_shifts
@@ -155,7 +154,6 @@ def write_run_folder(folder: Path, report: EvaluationReport, description: RunDes
     write_json(folder / "results.json", lines)
     for place in range(len(report.sequences)):
         _write_sequence(report.folder(folder, place), report, place)
-    _write_changes(folder, report)
     _write_skipped(folder, report)
     if truth is None:
         return
@@ -274,24 +272,6 @@ def _write_top_predictions(folder: Path, report: EvaluationReport, place: int) -
         "in_database": _cells(None if positives is None else positives.counts > 0, len(names)),
     }
     _write_columns(folder / "top_predictions.csv", columns)
-
-
-def _write_changes(folder: Path, report: EvaluationReport) -> None:
-    """Write `changes.csv` with the queries whose first prediction a sequence changes, if the system has sequences."""
-    scores, lines = report.ranked.system.final_scores.values(), []
-    database = report.ranked.dataset.database.names
-    filtered = [score for score in scores if isinstance(score.step, DriveFilter)]
-    for score, (place, sequence) in itertools.product(filtered, enumerate(report.sequences)):
-        before, after = (report.ranked.systems[name][place].rows[:, 0] for name in (score.base, score.name))
-        columns: list[Any] = [sequence.images.names]
-        for name, rows in ((score.base, before), (score.name, after)):
-            correct = report.is_correct(name, place)
-            columns += [_names(database, rows), _cells(None if correct is None else correct[:, 0], len(rows))]
-        changed = itertools.compress(zip(*columns, strict=True), before != after)
-        lines += [[score.name, sequence.name, *line] for line in changed]
-    if filtered:
-        header = ["system", "sequence", "query", "before", "correct_before", "after", "correct_after"]
-        write_csv(folder / "changes.csv", header, lines)
 
 
 def _write_skipped(folder: Path, report: EvaluationReport) -> None:

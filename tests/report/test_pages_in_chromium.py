@@ -86,6 +86,16 @@ def test_pages_and_their_charts_fit(tab, tmp_path, name, width):
     assert pixels.std() > 10
 
 
+def test_labels_of_charts_are_names_and_no_html(tab):
+    page = tab.page("one")
+    assert page.locator("#chart-depths .legendtext").all_text_contents() == [*SYSTEMS]
+    assert {*page.locator("#chart-intervals .ytick").all_text_contents()} == {*SYSTEMS}
+    colors = page.locator("#chart-depths .scatterlayer .js-line").evaluate_all(
+        "lines => lines.map(one => one.style.stroke)"
+    )
+    assert colors == ["rgb(138, 143, 152)", "rgb(11, 132, 198)", "rgb(225, 112, 26)"]
+
+
 def test_tables_are_sorted_by_click_and_by_key(tab):
     page = tab.page("one")
     scores, header = cells(page, 4), page.locator("[aria-label='Top predictions'] th").nth(3)
