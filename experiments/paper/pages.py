@@ -6,8 +6,8 @@ from urllib.parse import quote
 
 from experiments.paper.tables import Evaluations, average, printed_tables
 from mfvpr.report import Table
+from mfvpr.report.figures import panels, save_figure
 from mfvpr.report.pages import PAGE, Section, embed, values_table, write_comparison, write_page
-from mfvpr.report.plots import panels, save_figure
 from mfvpr.utils.fingerprints import versions
 
 _COSTS, _ABOUT = ("sizes", "seconds"), ("data_sets", "settings")  # names of tables

@@ -1,5 +1,6 @@
 """Figures of images: a pair beside its histogram of shifts, for queries and localized images; contact sheets."""
 
+import warnings
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
@@ -11,7 +12,9 @@ import jax
 import numpy as np
 from jaxtyping import Shaped, UInt8
 from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.collections import LineCollection
+from matplotlib.figure import Figure as Canvas
 from matplotlib.image import AxesImage
 from matplotlib.patches import Rectangle
 from PIL import Image
@@ -25,19 +28,45 @@ from mfvpr.evaluation.stages import Explanation, explain
 from mfvpr.localization.map import Map
 from mfvpr.localization.predictions import Localization
 from mfvpr.report.evaluations import EvaluationReport
-from mfvpr.report.plots import panels, save_figure
 from mfvpr.report.runs import Figure
 from mfvpr.utils.errors import InputError
-from mfvpr.utils.files import clip_middle, path_inside, printable
+from mfvpr.utils.files import clip_middle, path_inside, printable, replacing, require_replaceable
 
 ABOUT: tuple[str, ...] = ("system", "sequence", "outcome", "query", "prediction")  # keywords in the file of a figure
 _AGREES, _DIFFERS = "#2fa8ff", "#ff9a1f"  # told apart by color-blind people as well
+_SOFTWARE = b"mfvpr.report"  # at the start of every PNG file
 _MATCHES = 30  # drawn, the heaviest, as in the paper
 _GAP = 12  # px between the two images
 _GRAY = 150  # of an image that is not at hand
 _TITLE_LENGTH, _CAPTION_LENGTH, _NAME_LENGTH = 140, 100, 48  # characters that fit; of an image's name in a title
 _PAIRS = 12  # of a contact sheet; at least two of each sequence
 _SIDE = 320  # px of the longer side of an image on the sheet
+
+
+def panels(number: int, width: float, height: float, columns: int = 4, **options: Any) -> tuple[Canvas, list[Axes]]:
+    """Make a figure of panels, each of `width` x `height` inches, in rows of at most `columns`.
+
+    `options` go to `Figure.subplots`.
+    """
+    columns = min(columns, number)
+    rows = -(-number // columns)
+    figure = Canvas(figsize=(width * columns, height * rows), layout="constrained")
+    FigureCanvasAgg(figure)
+    axes = [*figure.subplots(rows, columns, squeeze=False, **options).flat]
+    for unused in axes[number:]:
+        unused.set_axis_off()
+    return figure, axes[:number]
+
+
+def save_figure(figure: Canvas, path: Path, *, dpi: int = 110, **options: Any) -> None:
+    """Write an image file; `options` go to `Figure.savefig`. Of existing files, only a PNG from here is replaced."""
+    is_png = path.suffix == ".png"
+    require_replaceable(path, _SOFTWARE if is_png else None)
+    if is_png:
+        options["metadata"] = {"Software": _SOFTWARE.decode(), **options.get("metadata", {})}
+    with replacing(path) as temporary, warnings.catch_warnings():
+        warnings.filterwarnings("ignore", message="Glyph .* missing")  # names in scripts that the font lacks
+        figure.savefig(temporary, dpi=dpi, **options)
 
 
 @dataclass(frozen=True)
@@ -150,12 +179,12 @@ class SequenceFigures:
 
     def __init__(self, report: EvaluationReport, place: int) -> None:
         """Take the parts of the sequence at a place, by the system that decides."""
-        headline = report.headline
+        headline, part, positives = report.headline, report.parts[place], report.positives
         self._report, self._sequence = report, report.sequences[place]
         self._matched, self._database = report.ranked.matched[place], report.ranked.dataset.database
-        self._ranked, self._correct = report.ranked.systems[headline][place], report.is_correct(headline, place)
-        self._reasons = report.by_sequence(report.reasons(headline))[place]
-        self._positives = report.positives[place]
+        self._ranked, self._reasons = report.ranked.systems[headline][place], report.reasons(headline)[part]
+        self._correct = None if positives is None else report.correct[headline][part]
+        self._positives = None if positives is None else positives.take(part)
 
     def verdicts(self, selection: int | Sequence[int]) -> dict[int, str]:
         """Verdicts of queries that get a figure: the selected rows, or so many, half of them correct if known."""

@@ -26,7 +26,7 @@ from mfvpr.io.containers import reading
 from mfvpr.report.evaluations import sequence_folder
 from mfvpr.report.figures import ABOUT
 from mfvpr.report.runs import LAST, file_names
-from mfvpr.report.tables import Table, format_estimate, format_interval, read_csv, read_table, table_of
+from mfvpr.report.tables import Table, format_estimate, format_interval, read_csv, table_of
 from mfvpr.utils.errors import InputError
 from mfvpr.utils.files import require_replaceable, write_text
 
@@ -144,7 +144,7 @@ class Run:
             self.within = threshold_words(truth["unit"], middle(self.thresholds)) if self.thresholds else ""
             names = ["table", "confidence", "precision_recall"] if self.thresholds else []
             names += ["skipped"] if (folder / "skipped.csv").exists() else []
-            self.tables = {name: read_table(folder / f"{name}.csv") for name in names}
+            self.tables = {name: read_csv(folder / f"{name}.csv") for name in names}
             lines = list[tuple[int, dict[str, str]]]()
             for number in range(len(self.sequences) if self.thresholds else 0):
                 gains = read_csv(sequence_folder(folder, self.sequences, number) / "gains.csv")
@@ -263,7 +263,8 @@ def _write_search_page(folder: Path, results: Mapping[str, Any], path: Path) -> 
         heading = (folder / "table.md").read_text("utf-8").splitlines()[0]
         summary = (folder / "summary.txt").read_text("utf-8") if (folder / "summary.txt").exists() else ""
         figures = {file.stem: embed(file.read_bytes()) for file in sorted((folder / "figures").glob("*.png"))}
-        tables = {caption: read_table(folder / "table.csv")}
+        rows = read_csv(folder / "table.csv")
+        tables = {caption: table_of(rows, [*rows[0]][:1])}
     about = values_table({name: value for name, value in results.items() if name not in _IN_TABLES})
     title, _, words = heading.partition(": ")
     text = summary.removeprefix(heading).strip()
@@ -293,13 +294,13 @@ def _recall_sections(runs: Mapping[str, Run], curves: Curves) -> list[Section]:
     rows, tables = list[dict[str, str]](), dict[str, Table]()
     groups = {"recall": {name: run.recall(system) for name, (run, system) in curves.items()}}
     for label, run in runs.items():
-        for cells in run.tables["table"].rows:
-            row = dict(zip(run.tables["table"].header, cells, strict=True))
+        for row in run.tables["table"]:
             if (sequence := row.get("sequence", _POOLED)) in run.parts:  # the plain mean has no interval
                 row[f"R@1{run.within}, 95 %"] = format_interval(run.recall(row["system"], sequence).interval)
             rows.append({"run": label} | row if label else row)
-        if run.tables["confidence"].rows:
-            tables["Confidence of top predictions, in %" + f": {label}" * bool(label)] = run.tables["confidence"]
+        if run.tables["confidence"]:
+            caption = "Confidence of top predictions, in %" + f": {label}" * bool(label)
+            tables[caption] = table_of(run.tables["confidence"], ["system"])
         if len(run.sequences) > 1 and len(runs) == 1:
             groups = {name: {part: run.recall(name, part) for part in run.parts} for name in curves}
     bars = {
@@ -349,9 +350,9 @@ def _precision_chart(curves: Curves, by: str) -> list[Any]:
     """Precision against recall, if the runs have them; names of curves have their average precision."""
     points = {}
     for name, (run, system) in curves.items():
-        rows = [row[2:] for row in run.tables["precision_recall"].rows if row[:2] == [system, by]]
+        rows = [row for row in run.tables["precision_recall"] if (row["system"], row["by"]) == (system, by)]
         if rows:
-            curve = PrecisionRecall(*np.array(rows, float).T)
+            curve = PrecisionRecall(*np.array([[*row.values()][2:] for row in rows], float).T)
             shown = np.unique(np.linspace(0, len(rows) - 1, _CURVE_POINTS).round().astype(int))
             pairs = np.stack([curve.recall, curve.precision], axis=1)[shown]
             points[f"{name}: AP {100 * curve.average_precision:.1f}"] = (100 * pairs).round(3).tolist()
@@ -417,5 +418,5 @@ def _settings_section(run: Run) -> Section:
         "Systems": values_table({row["system"]: row["parameters"] for row in run.results}),
     }
     if skipped := run.tables.get("skipped"):
-        tables["Images that could not be used"] = Table(skipped.header, skipped.rows, 3)
+        tables["Images that could not be used"] = table_of(skipped, [*skipped[0]])
     return Section("settings", "Seconds, settings and versions", tables=tables)

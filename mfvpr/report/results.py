@@ -137,13 +137,12 @@ class Result:
         """The top prediction of every query, by the final score that decides of each system."""
         predictions = []
         for names, report in self._reports(None, KS):
-            database = report.ranked.dataset.database.names
-            for place, ranked in enumerate(report.ranked.systems[report.headline]):
-                sequence, correct = report.sequences[place], report.is_correct(report.headline, place)
-                for query, (name, row) in enumerate(zip(sequence.images.names, ranked.rows[:, 0], strict=True)):
-                    top = (database[row], float(ranked.scores[query, 0])) if row >= 0 else (None, math.nan)
-                    is_correct = None if correct is None else bool(correct[query, 0])
-                    predictions.append(TopPrediction(*names, sequence.name, name, *top, is_correct))
+            database, ranked = report.ranked.dataset.database.names, report.rankings[report.headline]
+            hits = report.hits(report.headline).tolist() if report.thresholds else [None] * len(report.queries)
+            firsts = ranked.rows[:, 0].tolist(), ranked.scores[:, 0].tolist()
+            for (sequence, query), row, score, is_correct in zip(report.queries, *firsts, hits, strict=True):
+                top = (database[row], score) if row >= 0 else (None, math.nan)
+                predictions.append(TopPrediction(*names, sequence.name, query, *top, is_correct))
         return predictions
 
     def save(self, folder: Path | str, thresholds: Thresholds = None, ks: Sequence[int] = KS) -> list[Path]:
@@ -170,10 +169,11 @@ class Result:
         report = EvaluationReport(self.only)
         files = file_names([sequence.name for sequence in report.sequences])
         for place, sequence in enumerate(report.sequences):
+            ranked, part = self.only.systems[report.headline][place], report.parts[place]
             target = Path(path) / files[sequence.name] if len(files) > 1 else Path(path)
-            shortlist = report.ranked.systems[report.headline][place].shortlist
+            positives = None if report.positives is None else report.positives.take(part)
             sides = sequence.images, report.ranked.dataset.database
-            write_candidates(target, shortlist, *sides, layout, report.positives[place])
+            write_candidates(target, ranked.shortlist, *sides, layout, positives)
 
     def write_report(self, path: Path | str, thresholds: Thresholds = None, ks: Sequence[int] = KS) -> None:
         """Write the page of `mfvpr report`; of several data sets or systems, beside each other."""

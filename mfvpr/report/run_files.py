@@ -10,7 +10,6 @@ import numpy as np
 from jaxtyping import Bool
 
 from mfvpr.datasets.contents import Contents, fingerprints, readings
-from mfvpr.datasets.positives import stack_positives
 from mfvpr.datasets.published import published_differences
 from mfvpr.evaluation.confidence import write_confidences
 from mfvpr.evaluation.dataset_ranking import num_candidates
@@ -20,7 +19,7 @@ from mfvpr.evaluation.stages import Scales, dominant_shifts
 from mfvpr.evaluation.statistics import mcnemar, path_test
 from mfvpr.report.evaluations import NO_PLACE, EvaluationReport, confidence_table, recall_table
 from mfvpr.report.runs import file_names, write_about, write_json, write_table, writing
-from mfvpr.report.tables import format_number, write_csv
+from mfvpr.report.tables import write_csv
 from mfvpr.storage.feature_cache import FeatureCache
 from mfvpr.utils.fingerprints import versions
 
@@ -65,7 +64,7 @@ def heading(report: EvaluationReport, description: RunDescription) -> str:
     several = f" in {len(dataset.sequences)} sequences" if len(dataset.sequences) > 1 else ""
     incomplete = " (incomplete)" if any(published_differences(dataset)) else ""
     return (
-        f"{dataset.name}{incomplete}: {report.num_queries} queries{several}, {len(dataset.database)} database images, "
+        f"{dataset.name}{incomplete}: {len(report.queries)} queries{several}, {len(dataset.database)} database images, "
         f"{_num_candidates(report)} candidates ({settings['retrieval']['name']}), {matched_content(settings)}; "
         f"{description.truth_words}"
     )
@@ -100,7 +99,7 @@ def save_run(folder: Path, report: EvaluationReport, cache: FeatureCache) -> Non
         except TypeError:  # a function without recipe
             return name
 
-    dataset, system, truth = report.ranked.dataset, report.ranked.system, report.sequences[0].truth
+    dataset, system, truth = report.ranked.dataset, report.ranked.system, report.truth
     pipeline, known, words = system.pipeline, {"kind": "none"}, "no ground truth: rankings only"
     if truth is not None:
         known = {"kind": type(truth).__name__, "unit": truth.unit, "thresholds": report.thresholds}
@@ -127,10 +126,10 @@ def save_run(folder: Path, report: EvaluationReport, cache: FeatureCache) -> Non
 
 def write_run_folder(folder: Path, report: EvaluationReport, description: RunDescription) -> None:
     """Write all files of a run folder but run.json and the figures."""
-    dataset, truth, rows = report.ranked.dataset, report.sequences[0].truth, report.rows()
+    dataset, truth, rows = report.ranked.dataset, report.truth, report.rows()
     common = {
         "candidates": _num_candidates(report),
-        "queries": report.num_queries,
+        "queries": len(report.queries),
         "dataset": dataset.name,
         "data_fingerprint": fingerprints(description.contents),
         "versions": versions(),
@@ -152,8 +151,10 @@ def write_run_folder(folder: Path, report: EvaluationReport, description: RunDes
         recall_at = {str(k): round(recall, 6) for k, recall in row["recall_at"].items()}
         lines.append(row | {"recall_at": recall_at} | about | results)
     write_json(folder / "results.json", lines)
-    for place in range(len(report.sequences)):
-        _write_sequence(report.folder(folder, place), report, place)
+    _write_rankings(folder, report)
+    _write_shifts(folder, report)
+    if report.headline in report.probabilities:
+        _write_top_predictions(folder, report)
     _write_skipped(folder, report)
     if truth is None:
         return
@@ -163,7 +164,7 @@ def write_run_folder(folder: Path, report: EvaluationReport, description: RunDes
     write_csv(folder / "confidence.csv", table.header, table.rows)
     for name in report.ranked.systems:
         for by, curve in report.curves(name).items():
-            points += [[name, by, *map(format_number, point)] for point in zip(*curve, strict=True)]
+            points += [[name, by, *point] for point in zip(*curve, strict=True)]
     write_csv(folder / "precision_recall.csv", ["system", "by", "threshold", "precision", "recall"], points)
     provenance = common | {  # of confidences, which are fitted on these data
         "absent_queries": report.calibration[report.headline].num_absent,
@@ -177,41 +178,34 @@ def write_run_folder(folder: Path, report: EvaluationReport, description: RunDes
     write_confidences(folder / "confidence.json", fits, provenance)
 
 
-def _names(database: Sequence[str], rows: np.ndarray) -> Any:
+def _names(database: Sequence[str], rows: np.ndarray) -> np.ndarray:
     """Names of database images, "" for row -1."""
     return np.array([*database, ""], object)[rows]
 
 
-def _cells(correct: np.ndarray | None, number: int) -> list[int | str]:
+def _cells(correct: np.ndarray | None, number: int) -> np.ndarray:
     """1 or 0 for so many lines, or empty where it is unknown what is correct."""
-    return [""] * number if correct is None else correct.astype(int).tolist()
+    return np.full(number, "") if correct is None else correct.astype(int)
 
 
-def _write_columns(path: Path, columns: Mapping[str, Sequence[Any]]) -> None:
-    write_csv(path, [*columns], zip(*columns.values(), strict=True))
+def _write_queries(folder: Path, report: EvaluationReport, name: str, columns: Mapping[str, Any]) -> None:
+    """Write a table for each sequence, from columns of all queries."""
+    columns = {"query": [name for _, name in report.queries]} | columns
+    for place, part in enumerate(report.parts):
+        lines = zip(*(column[part] for column in columns.values()), strict=True)
+        write_csv(report.folder(folder, place) / name, [*columns], lines)
 
 
-def _write_sequence(folder: Path, report: EvaluationReport, place: int) -> None:
-    """Write rankings of a sequence by every system, and shifts and confidences of the one that decides."""
-    names, database = report.sequences[place].images.names, report.ranked.dataset.database.names
-    headline, files = report.headline, file_names([*report.ranked.systems])
-    refused = report.by_sequence(report.refusals(headline))[place]
-    for name, parts in report.ranked.systems.items():
-        ranking = names, database, parts[place], report.is_correct(name, place)
-        write_predictions(folder / "predictions" / f"{files[name]}.csv", *ranking)
-        if name == headline:
-            write_predictions(folder / "predictions.csv", *ranking, refused)
-    matched, predictions = report.ranked.matched[place], report.ranked.systems[headline][place].rows[:, 0]
-    if report.histogram is not None and not isinstance(matched.by_scale, Scales):
-        queries = np.flatnonzero((predictions >= 0) & ~refused)
-        places = np.argmax(matched.candidates.indices[queries] == predictions[queries, None], axis=1)
-        shifts, intervals, sizes = dominant_shifts(report.histogram, matched.by_scale, queries, places)
-        numbers = np.concatenate([shifts, intervals.transpose(0, 2, 1).reshape(-1, 4), sizes], axis=1)
-        columns = {"query": [names[query] for query in queries], "prediction": _names(database, predictions[queries])}
-        columns |= {name: [*map(format_number, column)] for name, column in zip(SHIFTS, numbers.T, strict=True)}
-        _write_columns(folder / "shifts.csv", columns)
-    if headline in report.probabilities:
-        _write_top_predictions(folder, report, place)
+def _write_rankings(folder: Path, report: EvaluationReport) -> None:
+    """Write the rankings of each sequence by every system, and with refusals by the one that decides."""
+    database, files, refused = report.ranked.dataset.database.names, file_names([*report.rankings]), report.refusals
+    for place, part in enumerate(report.parts):
+        target, queries = report.folder(folder, place), report.sequences[place].images.names
+        for name, rankings in report.ranked.systems.items():
+            ranking = queries, database, rankings[place], report.correct[name][part] if report.thresholds else None
+            write_predictions(target / "predictions" / f"{files[name]}.csv", *ranking)
+            if name == report.headline:
+                write_predictions(target / "predictions.csv", *ranking, refused(name)[part])
 
 
 def write_predictions(
@@ -232,46 +226,60 @@ def write_predictions(
     is_shown[:, 0] |= is_refused
     query, rank = np.nonzero(is_shown)
     images, is_refused = _names(database, ranked.rows[query, rank]), is_refused[query]
-    columns = {
-        "query": [queries[row] for row in query.tolist()],
-        "rank": (rank + 1).tolist(),
-        "database": np.where(is_refused, NO_PLACE, images),
-        "score": [*map(format_number, np.where(ranked.rows >= 0, ranked.scores, np.nan)[query, rank])],
-        "correct": _cells(None if correct is None else correct[query, rank], len(query)),
-        "refused": np.where(is_refused, images, ""),
-    }
-    _write_columns(path, columns)
+    columns = [
+        [queries[row] for row in query.tolist()],
+        (rank + 1).tolist(),
+        np.where(is_refused, NO_PLACE, images),
+        np.where(ranked.rows >= 0, ranked.scores, np.nan)[query, rank],
+        _cells(None if correct is None else correct[query, rank], len(query)),
+        np.where(is_refused, images, ""),
+    ]
+    write_csv(path, ["query", "rank", "database", "score", "correct", "refused"], zip(*columns, strict=True))
 
 
-def _write_top_predictions(folder: Path, report: EvaluationReport, place: int) -> None:
-    """Write `top_predictions.csv` of a sequence.
+def _write_shifts(folder: Path, report: EvaluationReport) -> None:
+    """Write `shifts.csv` of the predictions that are not refused, if a histogram of features of one scale decides."""
+    rows, database = report.rankings[report.headline].rows[:, 0], report.ranked.dataset.database.names
+    is_shown = (rows >= 0) & ~report.refusals(report.headline)
+    for place, part in enumerate(report.parts):
+        matched, queries = report.ranked.matched[place], np.flatnonzero(is_shown[part])
+        if report.histogram is None or isinstance(matched.by_scale, Scales):
+            continue
+        predictions, names = rows[part][queries], report.sequences[place].images.names
+        ranks = np.argmax(matched.candidates.indices[queries] == predictions[:, None], axis=1)
+        shifts, intervals, sizes = dominant_shifts(report.histogram, matched.by_scale, queries, ranks)
+        numbers = np.concatenate([shifts, intervals.transpose(0, 2, 1).reshape(-1, 4), sizes], axis=1)
+        pairs = zip(queries.tolist(), _names(database, predictions), numbers, strict=True)
+        lines = ([names[query], prediction, *line] for query, prediction, line in pairs)
+        write_csv(report.folder(folder, place) / "shifts.csv", ["query", "prediction", *SHIFTS], lines)
+
+
+def _write_top_predictions(folder: Path, report: EvaluationReport) -> None:
+    """Write `top_predictions.csv`.
 
     `score`, `confidence` and `correct` are of the first candidate, also where the prediction is `NO_PLACE` for a
     `reason`. `absent_confidence` is that without the images of the query's place, which `in_database` shows or not.
     """
-    name, names = report.headline, report.sequences[place].images.names
-    ranked, positives = report.ranked.systems[name][place], report.positives[place]
-    database, is_correct = report.ranked.dataset.database.names, report.is_correct(name, place)
-    correct = None if is_correct is None else is_correct[:, 0]
-    values = (report.reasons(name), *report.both_probabilities[name])
-    reasons, *both = (report.by_sequence(value)[place] for value in values)
-    is_refused, images = np.array([reason is not None for reason in reasons], bool), _names(database, ranked.rows[:, 0])
-    outcomes = np.full(len(names), "") if correct is None else np.where(correct, "correct", "incorrect")
+    name, count, positives = report.headline, len(report.queries), report.positives
+    ranked, reasons = report.rankings[name], report.reasons(name)
+    images = _names(report.ranked.dataset.database.names, ranked.rows[:, 0])
+    is_refused = np.array([reason is not None for reason in reasons])
+    correct = None if positives is None else report.hits(name)
+    outcomes = np.full(count, "") if correct is None else np.where(correct, "correct", "incorrect")
     # Rounding may move a confidence to another bin.
-    confidences = [["" if np.isnan(p) else repr(float(p)) for p in column] for column in both]
+    both = [["" if np.isnan(p) else repr(p) for p in values.tolist()] for values in report.both_probabilities[name]]
     columns = {
-        "query": names,
         "prediction": np.where(is_refused, NO_PLACE, images),
         "refused": np.where(is_refused, images, ""),
-        "score": [*map(format_number, ranked.scores[:, 0])],
-        "confidence": confidences[0],
-        "absent_confidence": confidences[1],
-        "correct": _cells(correct, len(names)),
+        "score": ranked.scores[:, 0],
+        "confidence": both[0],
+        "absent_confidence": both[1],
+        "correct": _cells(correct, count),
         "outcome": np.where(is_refused, "refused", outcomes),
         "reason": [reason or "" for reason in reasons],
-        "in_database": _cells(None if positives is None else positives.counts > 0, len(names)),
+        "in_database": _cells(None if positives is None else positives.counts > 0, count),
     }
-    _write_columns(folder / "top_predictions.csv", columns)
+    _write_queries(folder, report, "top_predictions.csv", columns)
 
 
 def _write_skipped(folder: Path, report: EvaluationReport) -> None:
@@ -290,23 +298,18 @@ def write_gains(folder: Path, report: EvaluationReport) -> None:
     By query and system, `gains.csv` says whether the first prediction is correct, and the rank of the first correct
     one. Its `place` along the map says which queries are neighbors, which intervals and tests across runs need.
     """
-    systems, places, truth = [*report.ranked.systems], np.arange(report.num_queries), report.sequences[0].truth
-    if truth is not None and (len(report.sequences) > 1 or truth.unit == "m"):  # else in the order of the queries
-        known = [positives for positives in report.positives if positives is not None]
-        places = places_along_path(stack_positives(known), truth.unit)
-    for part, sequence in enumerate(report.sequences):
-        columns = {"query": sequence.images.names, "place": report.by_sequence(places)[part].tolist()}
-        for name in systems:
-            correct = np.asarray(report.is_correct(name, part), bool)
-            ranks = np.where(correct.any(axis=1), np.argmax(correct, axis=1) + 1, 0)
-            columns[name] = correct[:, 0].astype(int).tolist()
-            columns[f"{name} rank"] = [rank or "" for rank in ranks.tolist()]
-        _write_columns(report.folder(folder, part) / "gains.csv", columns)
+    places, truth, positives = np.arange(len(report.queries)), report.truth, report.positives
+    if truth and positives and (len(report.sequences) > 1 or truth.unit == "m"):  # else in the order of the queries
+        places = places_along_path(positives, truth.unit)
+    columns: dict[str, Any] = {"place": places}
+    for name, correct in report.correct.items():
+        ranks = np.where(correct.any(axis=1), np.argmax(correct, axis=1) + 1, 0)
+        columns |= {name: correct[:, 0].astype(int), f"{name} rank": [rank or "" for rank in ranks.tolist()]}
+    _write_queries(folder, report, "gains.csv", columns)
     path, lines = np.argsort(places, kind="stable"), []
-    hits = {name: report.hits(name)[path] for name in systems}
-    for first, second in itertools.combinations(systems, 2):
+    hits = {name: report.hits(name)[path] for name in report.correct}
+    for first, second in itertools.combinations(hits, 2):
         test, path_p = mcnemar(hits[first], hits[second]), path_test(hits[first], hits[second])
-        numbers = map(format_number, (test.p_value, *path_p))
-        lines.append([first, second, test.only_first, test.only_second, *numbers])
+        lines.append([first, second, *test, *path_p])
     header = ["system", "other", "only_system", "only_other", "mcnemar_p", "design_effect", "path_p"]
     write_csv(folder / "differences.csv", header, lines)

@@ -19,7 +19,7 @@ from mfvpr.baselines.learned_weight import write_weight
 from mfvpr.datasets.ground_truth import threshold_words
 from mfvpr.evaluation.statistics import Estimate, mcnemar, path_test, recall_interval
 from mfvpr.report import runs
-from mfvpr.report.plots import MARK, PALE, panels, save_figure
+from mfvpr.report.figures import panels, save_figure
 from mfvpr.report.runs import Figure, file_names
 from mfvpr.report.tables import Table, data_frame, format_estimate, format_interval, format_value, format_values
 from mfvpr.tuning.sweeps.setting_search import Outcome
@@ -33,6 +33,7 @@ if TYPE_CHECKING:
     from mfvpr.tuning.learning.comparison import Comparison  # with Optax and Orbax, which sweeps do not wait for
     from mfvpr.tuning.learning.training import Fit
 
+_PALE, _MARK = "#2fa8ff", "#e8482c"
 _TOP = 10  # settings of the summary
 _MAX_HEAT_MAPS = 6
 
@@ -231,11 +232,11 @@ def _heat_map(outcome: Outcome, first: str, second: str) -> Canvas:
     panel.set_xticks(range(len(words[second])), [Path(word).name for word in words[second]], rotation=30)
     panel.set(xlabel=second, ylabel=first)
     corner = best[second] - 0.5, best[first] - 0.5
-    panel.add_patch(Rectangle(corner, 1, 1, linewidth=2.5, fill=False, edgecolor=MARK))
+    panel.add_patch(Rectangle(corner, 1, 1, linewidth=2.5, fill=False, edgecolor=_MARK))
     own = {"": ""} | {name: format_value(value) for name, value in axes.own_values.items()}
     if own[first] in words[first] and own[second] in words[second]:
         place = words[second].index(own[second]), words[first].index(own[first])
-        panel.plot(*place, marker="o", markersize=30, markerfacecolor="none", markeredgecolor=MARK)
+        panel.plot(*place, marker="o", markersize=30, markerfacecolor="none", markeredgecolor=_MARK)
     fixed = [f"{name} = {words[name][place]}" for name, place in best.items() if name not in ("", first, second)]
     panel.set_title("; ".join([f"{_label(outcome)} in %", *fixed]), fontsize=9, parse_math=False)
     figure.colorbar(image, ax=panel, label="%")
@@ -324,7 +325,7 @@ def _draw_curves(path: Path, fits: "Mapping[str, Fit]") -> None:
     figure, axes = panels(len(fits), 3.4, 2.6)
     for panel, (name, fit) in zip(axes, fits.items(), strict=True):
         steps, *columns = np.array(fit.history, float).T  # None becomes NaN
-        for values, label, color in zip(columns, ("loss", "validation"), (PALE, MARK), strict=True):
+        for values, label, color in zip(columns, ("loss", "validation"), (_PALE, _MARK), strict=True):
             known = np.isfinite(values)
             panel.plot(steps[known], values[known], label=label, color=color, marker=".", markersize=4)
         panel.set_title(name, fontsize=9)

@@ -1,10 +1,10 @@
 """Tables as text for the terminal, Markdown, CSV, and LaTeX; numbers and names in them."""
 
 import csv
-import io
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from types import SimpleNamespace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -76,43 +76,34 @@ def table_of(rows: Sequence[Mapping[str, str]], text_columns: Sequence[str]) -> 
     return Table(header, [[row.get(name, "") for name in header] for row in rows], len(texts))
 
 
-def read_table(path: Path) -> Table:
-    """The table of a file of `write_csv`; a ValueError if the file is cut off."""
+def read_csv(path: Path) -> list[dict[str, str]]:
+    """Rows of a file of `write_csv` by column; a ValueError if the file is cut off."""
     with path.open(encoding="utf-8", errors="surrogateescape", newline="") as file:
         header, *rows = csv.reader(file)
     if any(len(row) != len(header) for row in rows):
         raise ValueError(f"{path.name}: expected lines of {len(header)} cells")
-    return Table(header, rows)
+    return [dict(zip(header, row, strict=True)) for row in rows]
 
 
-def read_csv(path: Path) -> list[dict[str, str]]:
-    """Rows of a file of `write_csv` by column."""
-    table = read_table(path)
-    return [dict(zip(table.header, row, strict=True)) for row in table.rows]
-
-
-def write_csv(path: Path, header: Sequence[str], lines: Iterable[Sequence[str | int]]) -> None:
+def write_csv(path: Path, header: Sequence[str], lines: Iterable[Iterable[Any]]) -> None:
     """Write names as the very bytes that the file system has, so that they can be looked up again.
 
-    A spreadsheet may take a name that begins with `=`, `+`, `-` or `@` for a formula: import such columns as text.
+    Floating-point numbers get 7 digits, NaN an empty cell. A spreadsheet may take a name that begins with `=`, `+`, `-`
+    or `@` for a formula: import such columns as text.
     """
+
+    def text(cell: Any) -> Any:
+        return cell if not isinstance(cell, float | np.floating) else "" if np.isnan(cell) else f"{cell:.7g}"
+
     with replacing(path) as temporary:
-        temporary.write_bytes(_csv([header, *lines]).encode("utf-8", "surrogateescape"))
+        temporary.write_bytes(_csv([header, *(map(text, line) for line in lines)]).encode("utf-8", "surrogateescape"))
 
 
-def _csv(rows: Iterable[Sequence[str | int]]) -> str:
+def _csv(rows: Iterable[Iterable[Any]]) -> str:
     """Lines that end in \\n, where every cell with an end of a line is quoted."""
-    lines = []
-    for row in rows:
-        line = io.StringIO()
-        csv.writer(line).writerow(row)  # Python quotes \r only if it is in `lineterminator` (before 3.13)
-        lines.append(line.getvalue().removesuffix("\r\n") + "\n")
-    return "".join(lines)
-
-
-def format_number(value: Any) -> str:
-    """A number in a CSV file; empty for NaN."""
-    return "" if np.isnan(value) else f"{value:.7g}"
+    lines = list[str]()
+    csv.writer(SimpleNamespace(write=lines.append)).writerows(rows)  # which quotes both characters of its line ends
+    return "".join(line.removesuffix("\r\n") + "\n" for line in lines)
 
 
 def format_value(value: Any) -> str:
