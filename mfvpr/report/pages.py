@@ -7,7 +7,6 @@ import itertools
 import json
 from base64 import b64encode
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
 from hashlib import sha256
 from io import BytesIO
 from pathlib import Path
@@ -46,27 +45,21 @@ _SEARCH_TABLES = {"rows": "All scores", "axes": "All settings", "jobs": "All job
 _IN_TABLES = {"settings", "rows", "queries", "report", "jobs"}  # names in results.json
 
 
-@dataclass(frozen=True)
-class Section:
-    """A part of a page; `name` is a word for its element, `words` stand above everything in it."""
+def write_page(
+    path: Path,
+    template: str = "sections.html",
+    *,
+    title: str,
+    words: str,
+    facts: Mapping[str, str],
+    charts: Sequence[Mapping[str, Any]] = (),
+    **content: Any,
+) -> None:
+    """Write one HTML file; the same bytes for the same values. An earlier page is replaced; InputError for other files.
 
-    name: str
-    title: str
-    words: str = ""
-    charts: Sequence[Mapping[str, Any]] = ()  # drawn by script.js
-    tables: Mapping[str, Table] = field(default_factory=dict)  # by caption
-    links: Sequence[tuple[str, str]] = ()  # words, and relative addresses of other pages
-    text: str = ""  # keeps its lines
-    images: Mapping[str, str] = field(default_factory=dict)  # `data:` URIs by title
-    pictures: Sequence[Mapping[str, Any]] = ()  # see `Run.pictures`; they can be filtered, as `predictions` can
-    predictions: Sequence[Mapping[str, str]] = ()  # see `Run.predictions`
-
-
-def write_page(path: Path, *, title: str, words: str, facts: Mapping[str, str], sections: Sequence[Section]) -> None:
-    """Write one HTML file; the same bytes for the same values.
-
-    `words` stand below the title; `facts` are the most important values, by name. An earlier page is replaced; an
-    InputError for other files.
+    `words` stand below the title; `facts` are the most important values, by name; `content` is the template's. That of
+    sections.html are `parts`, by title: the `words`, `links`, `text`, `images` and `tables` of each, as far as it has
+    them. Links are words and relative addresses, images `data:` URIs by name, and tables are by caption.
     """
     require_replaceable(path, _POLICY)
     from jinja2 import Environment, FileSystemLoader, StrictUndefined
@@ -75,25 +68,21 @@ def write_page(path: Path, *, title: str, words: str, facts: Mapping[str, str], 
 
     environment = Environment(loader=FileSystemLoader(_TEMPLATES), autoescape=True, undefined=StrictUndefined)
     environment.trim_blocks = environment.lstrip_blocks = True
+    environment.filters["flat"] = flat
     environment.policies["json.dumps_kwargs"] = {"sort_keys": True, "allow_nan": False}
     scripts = [get_plotlyjs(), (_TEMPLATES / "script.js").read_text("utf-8")]
     hashes = [b64encode(sha256(script.encode()).digest()).decode() for script in scripts]
-    text = environment.get_template("page.html").render(
+    text = environment.get_template(template).render(
         title=title,
         words=words,
         facts=facts,
-        sections=sections,
-        charts={chart["name"]: chart for section in sections for chart in section.charts},
+        charts=charts,
         scripts=map(Markup, scripts),  # of this package and of plotly, as is the style
         style=Markup((_TEMPLATES / "style.css").read_text("utf-8")),
         hashes=" ".join(f"'sha256-{each}'" for each in hashes),
+        **content,
     )
     write_text(path, text)
-
-
-def values_table(values: Mapping[str, Any]) -> Table:
-    """Nested values by their dotted names."""
-    return Table(["name", "value"], [[*pair] for pair in flat(values)], text_columns=2)
 
 
 def flat(values: Mapping[str, Any]) -> Iterator[tuple[str, str]]:
@@ -114,7 +103,7 @@ class Run:
     """The content of a run folder.
 
     Attributes:
-        results: rows of `results.json`; `common` is the first, for values that all share, such as the `description`.
+        results: rows of `results.json`; `common` is the first, for values that all share.
         about: the content of `run.json`.
         tables: of CSV files, by name without suffix.
         systems: names in the order of the results; the `headline` decides.
@@ -134,7 +123,7 @@ class Run:
             self.results: list[dict[str, Any]] = _read_json(folder / LAST)
             self.about: dict[str, Any] = _read_json(folder / "run.json")
             self.common = self.results[0]
-            self.description, truth = self.common["description"], self.common["ground_truth"]
+            truth = self.common["ground_truth"]
             self.systems = list(dict.fromkeys(row["system"] for row in self.results))
             self.headline = next(row["system"] for row in self.results if row["decides"])
             sequences = dict.fromkeys(row.get("sequence", row["dataset"]) for row in self.results)
@@ -210,17 +199,38 @@ def write_report(folder: Path, path: Path | None = None) -> Path:
         _write_search_page(folder, results, path)
         return path
     run = Run(folder)
-    sections, facts = list[Section](), {"decides": run.headline}
+    common, facts, recall = run.common, {"decides": run.headline}, {"recall": None, "charts": []}
     if run.queries:
-        sections += _recall_sections({"": run}, {name: (run, name) for name in run.systems})
+        recall = _recall({"": run}, {name: (run, name) for name in run.systems})
         for name in (run.headline, RETRIEVAL):
             facts[f"{name}, R@1{run.within}, %"] = format_estimate(run.recall(name))
-    facts["seconds in all"] = f"{sum(run.common['seconds'].values()):.1f}"
-    sections += [_predictions_section(run), _settings_section(run)]
-    title, dataset = run.common["dataset"], run.about["settings"]["dataset"]
+    facts["seconds in all"] = f"{sum(common['seconds'].values()):.1f}"
+    with reading(folder / LAST, mend=_EXPECTED):
+        pictures, predictions = run.pictures(), [*itertools.islice(run.predictions(), MOST_PREDICTIONS + 1)]
+    per_query = 1 / max(common["queries"], 1)
+    seconds = [[stage, f"{value:.3f}", f"{value * per_query:.4f}"] for stage, value in common["seconds"].items()]
+    made = {name: run.about.get(name) for name in ("command", "commit")}
+    made |= {name.replace("_", " "): common[name] for name in ("ground_truth", "data_fingerprint")}
+    skipped = run.tables.get("skipped", [])
+    title, dataset = common["dataset"], run.about["settings"]["dataset"]
     if title == _NAMELESS and isinstance(dataset.get("queries"), str):  # the ends of the paths of its folders
         title = " in ".join("/".join(Path(dataset[side]).parts[-2:]) for side in ("queries", "database"))
-    write_page(path, title=title, words=run.description, facts=facts, sections=sections)
+    write_page(
+        path,
+        "run.html",
+        title=title,
+        words=common["description"],
+        facts=facts,
+        pictures=pictures,
+        predictions=predictions[:MOST_PREDICTIONS],
+        is_cut=len(predictions) > MOST_PREDICTIONS,
+        seconds=Table(["stage", "seconds", "per query"], seconds),
+        run=run,
+        made=made,
+        systems={row["system"]: row["parameters"] for row in run.results},
+        skipped=skipped and table_of(skipped, [*skipped[0]]),
+        **recall,
+    )
     return path
 
 
@@ -236,24 +246,27 @@ def write_comparison(folders: Sequence[Path], path: Path) -> None:
     runs = dict(zip(labels, map(Run, folders), strict=True))
     overview, facts, settings = [], {}, {}
     for label, run in runs.items():
-        overview.append([label, run.common["dataset"], run.headline, run.description])
+        overview.append([label, run.common["dataset"], run.headline, run.common["description"]])
         if run.queries:
             facts[f"{label}, R@1{run.within}, %"] = format_estimate(run.recall(run.headline))
         about = {name: run.about.get(name) for name in ("command", "commit", "settings", "ground_truth")}
         about |= {name: run.common[name] for name in ("data_fingerprint", "versions", "seconds")}
         settings[label] = dict(flat(about))
-    header = ["run", "data set", "decides", "what was evaluated"]
-    sections = [Section("runs", "Runs", tables={"Runs": Table(header, overview, text_columns=4)})]
+    header, recall = ["run", "data set", "decides", "what was evaluated"], {"recall": None, "charts": []}
     if known := {label: run for label, run in runs.items() if run.queries}:
-        curves = {f"{label}: {run.headline}": (run, run.headline) for label, run in known.items()}
-        sections += _recall_sections(known, curves)
+        recall = _recall(known, {f"{label}: {run.headline}": (run, run.headline) for label, run in known.items()})
     names = dict.fromkeys(name for values in settings.values() for name in values)
     rows = [[name, *(values.get(name, "") for values in settings.values())] for name in names]
-    differing = Table(["name", *settings], [row for row in rows if len({*row[1:]}) > 1], 1 + len(settings))
-    sections.append(Section("settings", "Settings and versions", tables={"What differs": differing}))
-    words = "The systems that decide, beside each other; each run has a page of its own."
-    title = f"{', '.join(dict.fromkeys(run.common['dataset'] for run in runs.values()))}: {len(runs)} runs compared"
-    write_page(path, title=title, words=words, facts=facts, sections=sections)
+    write_page(
+        path,
+        "comparison.html",
+        title=f"{', '.join(dict.fromkeys(run.common['dataset'] for run in runs.values()))}: {len(runs)} runs compared",
+        words="The systems that decide, beside each other; each run has a page of its own.",
+        facts=facts,
+        runs=Table(header, overview, text_columns=4),
+        differing=Table(["name", *settings], [row for row in rows if len({*row[1:]}) > 1], 1 + len(settings)),
+        **recall,
+    )
 
 
 def _write_search_page(folder: Path, results: Mapping[str, Any], path: Path) -> None:
@@ -265,64 +278,51 @@ def _write_search_page(folder: Path, results: Mapping[str, Any], path: Path) -> 
         figures = {file.stem: embed(file.read_bytes()) for file in sorted((folder / "figures").glob("*.png"))}
         rows = read_csv(folder / "table.csv")
         tables = {caption: table_of(rows, [*rows[0]][:1])}
-    about = values_table({name: value for name, value in results.items() if name not in _IN_TABLES})
     title, _, words = heading.partition(": ")
-    text = summary.removeprefix(heading).strip()
-    sections = [
-        Section("results", "Results", text=text, images=figures, tables=tables),
-        Section("settings", "Settings and versions", tables={"Run": about}),
-    ]
-    write_page(path, title=title, words=words, facts={}, sections=sections)
+    settings = {name: value for name, value in results.items() if name not in _IN_TABLES}
+    found = {"text": summary.removeprefix(heading).strip(), "images": figures, "tables": tables}
+    parts = {"Results": found, "Settings and versions": {"tables": {"Run": settings}}}
+    write_page(path, title=title, words=words, facts={}, parts=parts)
 
 
 # --- recall of runs with ground truth ----------------------------------------------------------------------------
 
 Curves = Mapping[str, tuple[Run, str]]  # a run and one of its systems, by the name of their curve
+Chart = dict[str, Any]  # for script.js: "lines" of points (x, y in %) by name, or "bars" with intervals by their group
 
 
-def _chart(kind: str, name: str, title: str, axes: tuple[str, str], scale: str, data: Mapping[str, Any]) -> list[Any]:
-    """A chart for script.js, if there is something to draw: "lines" of points (x, y in %), or "bars" with intervals.
-
-    `data` are by the name of the curve, or of the group of bars; `axes` are words of x and y, `scale` is that of x.
-    """
-    chart = {"kind": kind, "name": name, "title": title, "axes": axes, "scale": scale, "data": [*data.items()]}
-    return [chart] if data else []
-
-
-def _recall_sections(runs: Mapping[str, Run], curves: Curves) -> list[Section]:
-    """Recall of all systems of runs by name; of the curves with intervals, charts, and tests of every two."""
-    rows, tables = list[dict[str, str]](), dict[str, Table]()
+def _recall(runs: Mapping[str, Run], curves: Curves) -> dict[str, Any]:
+    """Content of recall.html: of all systems of runs by name; of the curves, charts, and tests of every two."""
+    rows = list[dict[str, str]]()
     groups = {"recall": {name: run.recall(system) for name, (run, system) in curves.items()}}
     for label, run in runs.items():
         for row in run.tables["table"]:
             if (sequence := row.get("sequence", _POOLED)) in run.parts:  # the plain mean has no interval
                 row[f"R@1{run.within}, 95 %"] = format_interval(run.recall(row["system"], sequence).interval)
             rows.append({"run": label} | row if label else row)
-        if run.tables["confidence"]:
-            caption = "Confidence of top predictions, in %" + f": {label}" * bool(label)
-            tables[caption] = table_of(run.tables["confidence"], ["system"])
         if len(run.sequences) > 1 and len(runs) == 1:
             groups = {name: {part: run.recall(name, part) for part in run.parts} for name in curves}
     bars = {
         name: [(member, 100 * bar.recall, [100 * end for end in bar.interval]) for member, bar in group.items()]
         for name, group in groups.items()
     }
-    axes, words = ("recall at 1, %", ""), "In %, at the middle tolerance. "
-    words += "The 95 % intervals are wider if neighboring queries fail together."
-    charts = _chart("bars", "intervals", "Recall at 1, with intervals", axes, "share", bars)
-    charts += _tolerance_chart(curves) + _depths_chart(curves)
-    recall = {"Recall of every system": table_of(rows, ("run", "system", "sequence"))}
-    precision = _precision_chart(curves, "score") + _precision_chart(curves, "confidence")
-    about = "AP: average precision. R@100P: recall at 100 % precision. ECE: expected calibration error of the "
-    about += "confidence."
-    return [
-        Section("recall", "Recall", words, charts, recall),
-        _pairs_section(curves),
-        Section("confidence", "Precision and recall", about, precision, tables),
+    intervals = {"name": "intervals", "title": "Recall at 1, with intervals", "axes": ("recall at 1, %", "")}
+    confidences = {label: run.tables["confidence"] for label, run in runs.items()}
+    charts = [
+        intervals | {"kind": "bars", "scale": "share", "data": [*bars.items()]},
+        _tolerance_chart(curves),
+        _depths_chart(curves),
+        *(_precision_chart(curves, by) for by in ("score", "confidence")),
     ]
+    return {
+        "recall": table_of(rows, ("run", "system", "sequence")),
+        "confidences": {label: table_of(table, ["system"]) for label, table in confidences.items() if table},
+        "charts": [chart for chart in charts if chart["data"]],
+        **_differences(curves),
+    }
 
 
-def _depths_chart(curves: Curves) -> list[Any]:
+def _depths_chart(curves: Curves) -> Chart:
     """Recall at K from 1 to all candidates, at all small Ks and some larger ones."""
     points = {}
     for name, (run, system) in curves.items():
@@ -330,10 +330,11 @@ def _depths_chart(curves: Curves) -> list[Any]:
         depths = np.unique(np.geomspace(1, largest, _CURVE_POINTS).round().astype(int)).tolist()
         points[name] = [(k, 100 * float(run.hits(system, k).mean())) for k in depths]
     axes = "K, the first candidates", "recall at K, %"
-    return _chart("lines", "depths", "Recall over K", axes, "log", points)
+    chart = {"name": "depths", "title": "Recall over K", "axes": axes}
+    return chart | {"kind": "lines", "scale": "log", "data": [*points.items()]}
 
 
-def _tolerance_chart(curves: Curves) -> list[Any]:
+def _tolerance_chart(curves: Curves) -> Chart:
     """Recall of all queries over the threshold, of the runs with several thresholds in the unit of the first."""
     points, (run, _) = dict[str, list[tuple[float, float]]](), next(iter(curves.values()))
     unit, k = run.common["ground_truth"]["unit"], min(run.common["recall_at"], key=int)
@@ -343,10 +344,11 @@ def _tolerance_chart(curves: Curves) -> list[Any]:
             recalls = [row["recall_at"][k] for row in rows if row.get("sequence", _POOLED) == _POOLED]
             points[name] = [(at, 100 * recall) for at, recall in zip(run.thresholds, recalls, strict=True)]
     axes = f"tolerance, {unit}", f"recall at {k}, %"
-    return _chart("lines", "tolerances", "Recall over tolerance", axes, "linear", points)
+    chart = {"name": "tolerances", "title": "Recall over tolerance", "axes": axes}
+    return chart | {"kind": "lines", "scale": "linear", "data": [*points.items()]}
 
 
-def _precision_chart(curves: Curves, by: str) -> list[Any]:
+def _precision_chart(curves: Curves, by: str) -> Chart:
     """Precision against recall, if the runs have them; names of curves have their average precision."""
     points = {}
     for name, (run, system) in curves.items():
@@ -357,10 +359,11 @@ def _precision_chart(curves: Curves, by: str) -> list[Any]:
             pairs = np.stack([curve.recall, curve.precision], axis=1)[shown]
             points[f"{name}: AP {100 * curve.average_precision:.1f}"] = (100 * pairs).round(3).tolist()
     axes = "recall of queries with a correct image, %", "precision, %"
-    return _chart("lines", f"precision-{by}", f"Precision and recall by {by}", axes, "percent", points)
+    chart = {"name": f"precision-{by}", "title": f"Precision and recall by {by}", "axes": axes}
+    return chart | {"kind": "lines", "scale": "percent", "data": [*points.items()]}
 
 
-def _pairs_section(curves: Curves) -> Section:
+def _differences(curves: Curves) -> dict[str, Table]:
     """Tests of every two curves, query by query, and the pairs that cannot be compared."""
     rows, incomparable = [], []
     for (name, (run, system)), (other, (second, other_system)) in itertools.combinations(curves.items(), 2):
@@ -371,15 +374,9 @@ def _pairs_section(curves: Curves) -> Section:
         test, path = mcnemar(*hits), path_test(*hits)
         numbers = (f"{value:.2g}" for value in (test.p_value, *path))
         rows.append([name, other, str(test.only_first), str(test.only_second), *numbers])
-    words = (
-        "How many queries only one of two predicts correctly, and how probable that is if neither is better, by "
-        "McNemar's exact test, which takes queries for independent, and by a test along the path."
-    )
     header = ["system", "other", "only system", "only other", "McNemar p", "queries worth one", "p along the path"]
-    tables = {"Every two of the same queries": Table(header, rows, text_columns=2)} if rows else {}
-    if incomparable:
-        tables["Not comparable query by query"] = Table(["run", "other", "why"], incomparable, 3)
-    return Section("differences", "Differences", words, tables=tables)
+    reasons = Table(["run", "other", "why"], incomparable, text_columns=3)
+    return {"differences": Table(header, rows, text_columns=2), "incomparable": reasons}
 
 
 def _incomparable_reason(first: Run, second: Run) -> str | None:
@@ -390,33 +387,3 @@ def _incomparable_reason(first: Run, second: Run) -> str | None:
         return "another ground truth"
     same = first.queries == second.queries and first.sequences == second.sequences
     return None if same else "other queries"
-
-
-# --- predictions and settings of a run ---------------------------------------------------------------------------
-
-
-def _predictions_section(run: Run) -> Section:
-    with reading(run.folder / LAST, mend=_EXPECTED):
-        pictures, predictions = run.pictures(), [*itertools.islice(run.predictions(), MOST_PREDICTIONS + 1)]
-    words = "Query and top prediction with their heaviest matches, and the histogram of their shifts. An incorrect "
-    words += "prediction has the correct image below it. The table has the queries without a picture, too."
-    if len(predictions) > MOST_PREDICTIONS:
-        words += f" It has the first {MOST_PREDICTIONS}; the others are in the folder `predictions` of the run."
-    return Section("predictions", "Predictions", words, pictures=pictures, predictions=predictions[:MOST_PREDICTIONS])
-
-
-def _settings_section(run: Run) -> Section:
-    common, queries = run.common, max(run.common["queries"], 1)
-    about = {name: run.about.get(name) for name in ("command", "commit")}
-    about |= {name.replace("_", " "): common[name] for name in ("ground_truth", "data_fingerprint")}
-    seconds = [[stage, f"{value:.3f}", f"{value / queries:.4f}"] for stage, value in common["seconds"].items()]
-    tables = {
-        "Seconds, without what the cache had already": Table(["stage", "seconds", "per query"], seconds),
-        "Run": values_table(about),
-        "Settings": values_table(run.about["settings"]),
-        "Versions": values_table(common["versions"]),
-        "Systems": values_table({row["system"]: row["parameters"] for row in run.results}),
-    }
-    if skipped := run.tables.get("skipped"):
-        tables["Images that could not be used"] = table_of(skipped, [*skipped[0]])
-    return Section("settings", "Seconds, settings and versions", tables=tables)
