@@ -9,8 +9,7 @@ from mfvpr.report import Table, write_json
 from mfvpr.report.evaluations import sequence_folder
 from mfvpr.report.figures import ABOUT
 from mfvpr.report.run_files import write_predictions
-from mfvpr.report.runs import file_names
-from mfvpr.report.tables import write_csv
+from mfvpr.report.runs import file_names, write_csv
 from mfvpr.utils.files import printable
 
 HOSTILE = (

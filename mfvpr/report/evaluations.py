@@ -14,21 +14,12 @@ from mfvpr.core.histogram import HistogramOfShifts
 from mfvpr.datasets.datasets import MEANS, QuerySequence
 from mfvpr.datasets.ground_truth import Truth, Unit, middle, threshold_words
 from mfvpr.datasets.positives import Positives, stack_positives
-from mfvpr.evaluation.confidence import (
-    CalibrationData,
-    Confidence,
-    PrecisionRecall,
-    absent_ranking,
-    calibration_data,
-    chance_calibration_error,
-    precision_recall,
-    reliability,
-)
+from mfvpr.evaluation import confidence
+from mfvpr.evaluation.confidence import CalibrationData, Confidence, PrecisionRecall
 from mfvpr.evaluation.dataset_ranking import KS, RankedDataset, Reason
 from mfvpr.evaluation.protocol import Half, halves, halves_of_map
 from mfvpr.evaluation.rankings import Ranked
-from mfvpr.report.runs import file_names
-from mfvpr.report.tables import Table, table_of
+from mfvpr.report.runs import Table, file_names, table_of
 from mfvpr.utils.errors import InputError
 
 NO_PLACE = "no place"  # the prediction for a query whose place the database does not seem to show
@@ -152,10 +143,11 @@ class EvaluationReport:
         return sequence_folder(run, [sequence.name for sequence in self.sequences], place)
 
     @cached_property
-    def both_probabilities(self) -> dict[str, Float[np.ndarray, "2 queries"]]:
-        """Confidence by system, of the queries as they are, and without the images of their place; NaN = unknown.
+    def probabilities(self) -> dict[str, Float[np.ndarray, "2 queries"]]:
+        """Confidence by system, of the queries as they are, and without the images of their place.
 
         Without `confidences`, each half of the path has those of a fit on the other, without what shows places of both.
+        NaN without a prediction, or without anything to fit on.
         """
         names = self.calibration if self.confidences is None else self.confidences
         both = {name: np.full((2, len(self.queries)), np.nan) for name in names if name in self.rankings}
@@ -164,20 +156,15 @@ class EvaluationReport:
                 present[:] = self.confidences[name](self.rankings[name])
                 parts = self.parts, self.ranked.systems[name], self._truths
                 for part, ranked, truth in zip(*parts, strict=True) if self.thresholds else ():
-                    absent[part] = self.confidences[name](absent_ranking(ranked, truth, self.threshold))
+                    absent[part] = self.confidences[name](confidence.absent_ranking(ranked, truth, self.threshold))
                 continue
             for half in self.path_halves():
                 tune, report = self.calibration[name].take(half.tune), self.calibration[name].take(half.report)
                 if np.isfinite(tune.present).all(axis=1).any():
-                    confidence = tune.fit()
-                    present[half.report] = confidence.probability(report.present)
-                    absent[half.report] = confidence.probability(report.absent)
+                    fitted = tune.fit()
+                    present[half.report] = fitted.probability(report.present)
+                    absent[half.report] = fitted.probability(report.absent)
         return both
-
-    @property
-    def probabilities(self) -> dict[str, Float[np.ndarray, " queries"]]:
-        """Confidence by system, NaN without a prediction, or without anything to fit on."""
-        return {name: present for name, (present, _) in self.both_probabilities.items()}
 
     @cached_property
     def calibration(self) -> dict[str, CalibrationData]:
@@ -185,7 +172,7 @@ class EvaluationReport:
         calibration = {}
         for name, rankings in self.ranked.systems.items() if self.thresholds else ():
             pairs = zip(rankings, self._truths, strict=True)
-            parts = [calibration_data(ranked, truth, self.threshold) for ranked, truth in pairs]
+            parts = [confidence.calibration_data(ranked, truth, self.threshold) for ranked, truth in pairs]
             calibration[name] = CalibrationData(*map(np.concatenate, zip(*parts, strict=True)))
         return calibration
 
@@ -193,7 +180,7 @@ class EvaluationReport:
         """Why predictions are `NO_PLACE`, objects; None = they are not."""
         reasons = np.full(len(self.queries), None, object)
         if self.least_confidence is not None:
-            reasons[~(self.probabilities[system] >= self.least_confidence)] = "low confidence"
+            reasons[~(self.probabilities[system][0] >= self.least_confidence)] = "low confidence"
         reasons[self.rankings[system].rows[:, 0] < 0] = "no candidates"
         if self.lacking is not None and system == self.headline:
             for query, reason in enumerate(itertools.chain(*self.lacking)):
@@ -209,9 +196,9 @@ class EvaluationReport:
         ranked = self.rankings[system]
         values = {"score": np.where(ranked.rows[:, 0] >= 0, ranked.scores[:, 0], np.nan)}
         if system in self.probabilities:
-            values["confidence"] = self.probabilities[system]
+            values["confidence"] = self.probabilities[system][0]
         has_positives = None if self.positives is None else self.positives.counts > 0
-        return {by: precision_recall(each, self.hits(system), has_positives) for by, each in values.items()}
+        return {by: confidence.precision_recall(each, self.hits(system), has_positives) for by, each in values.items()}
 
     @property
     def _truths(self) -> list[Truth]:
@@ -258,24 +245,23 @@ def confidence_table(evaluation: EvaluationReport) -> Table:
     confidence. "ECE with absent" counts each query once more without the images of its place, as the fits do. With
     `least_confidence`, counts of queries follow.
     """
+    is_refusing, rows = evaluation.least_confidence is not None, []
     header = [f"{name} by {by}" for by in ("score", "confidence") for name in ("AP", "R@100P", "R@99P")]
     header += ["ECE", "by chance", "ECE with absent"]
-    rows = []
-    for name, probabilities in evaluation.probabilities.items():
-        fractions = []
+    header += ["correct", "incorrect", "refused", "of these correct"] if is_refusing else []
+    for name, (present, absent) in evaluation.probabilities.items():
+        correct, fractions = evaluation.hits(name), list[float]()
         for curve in evaluation.curves(name).values():
             fractions += [curve.average_precision, curve.recall_at(1.0), curve.recall_at(0.99)]
-        correct = evaluation.hits(name)
-        fractions += [reliability(probabilities, correct).calibration_error, chance_calibration_error(probabilities)]
-        both = np.concatenate(evaluation.both_probabilities[name])
-        fractions.append(reliability(both, np.append(correct, np.zeros(len(correct), bool))).calibration_error)
-        known = 3 if np.isnan(probabilities).all() else len(fractions)  # an unknown confidence has empty cells
+        never = np.zeros(len(correct), bool)
+        with_absent = confidence.reliability(np.append(present, absent), np.append(correct, never))
+        fractions.append(confidence.reliability(present, correct).calibration_error)
+        fractions += [confidence.chance_calibration_error(present), with_absent.calibration_error]
+        known = 3 if np.isnan(present).all() else len(fractions)  # an unknown confidence has empty cells
         cells = [f"{100 * value:.1f}" for value in fractions[:known]] + [""] * (len(fractions) - known)
-        if evaluation.least_confidence is not None:
+        if is_refusing:
             refused = evaluation.refusals(name)
             counts = (correct & ~refused, ~correct & ~refused, refused, refused & correct)
             cells += [str(int(selection.sum())) for selection in counts]
         rows.append([name, *cells])
-    if evaluation.least_confidence is not None:
-        header += ["correct", "incorrect", "refused", "of these correct"]
     return Table(["system", *header], rows)

@@ -24,8 +24,7 @@ from mfvpr.evaluation.statistics import Estimate, estimate, mcnemar, path_test
 from mfvpr.io.containers import reading
 from mfvpr.report.evaluations import sequence_folder
 from mfvpr.report.figures import ABOUT
-from mfvpr.report.runs import LAST, file_names
-from mfvpr.report.tables import Table, format_estimate, format_interval, read_csv, table_of
+from mfvpr.report.runs import LAST, Table, file_names, format_estimate, format_interval, read_csv, table_of
 from mfvpr.utils.errors import InputError
 from mfvpr.utils.files import require_replaceable, write_text
 
@@ -103,16 +102,13 @@ class Run:
     """The content of a run folder.
 
     Attributes:
-        results: rows of `results.json`; `common` is the first, for values that all share.
-        about: the content of `run.json`.
-        tables: of CSV files, by name without suffix.
+        results: rows of `results.json`; `common` is the first, for values that all share. `about` is run.json.
+        tables: rows of CSV files, by name without suffix.
         systems: names in the order of the results; the `headline` decides.
         sequences: names; a single one without a name has the data set's.
-        parts: numbers of the sequences by name, and None by the name of all queries together.
-        thresholds: of a correct prediction, ascending; none without ground truth.
-        within: the middle threshold, as it stands behind R@K.
+        within: the middle of the `thresholds`, as it stands behind R@K; "" without ground truth.
         queries: names of the Q queries of all sequences along the path; none without ground truth.
-        sequence_of: numbers of their sequences `[Q]`.
+        sequence_of: names of their sequences `[Q]`.
         ranks: of their first correct candidates `[Q]` by system, 0 = no candidate is correct.
     """
 
@@ -128,30 +124,28 @@ class Run:
             self.headline = next(row["system"] for row in self.results if row["decides"])
             sequences = dict.fromkeys(row.get("sequence", row["dataset"]) for row in self.results)
             self.sequences = [name for name in sequences if name not in MEANS]
-            self.parts = {name: number for number, name in enumerate(self.sequences)} | {_POOLED: None}
             self.thresholds: list[float] = truth.get("thresholds", [])
             self.within = threshold_words(truth["unit"], middle(self.thresholds)) if self.thresholds else ""
             names = ["table", "confidence", "precision_recall"] if self.thresholds else []
             names += ["skipped"] if (folder / "skipped.csv").exists() else []
             self.tables = {name: read_csv(folder / f"{name}.csv") for name in names}
-            lines = list[tuple[int, dict[str, str]]]()
-            for number in range(len(self.sequences) if self.thresholds else 0):
+            lines = list[tuple[str, dict[str, str]]]()
+            for number, name in enumerate(self.sequences if self.thresholds else ()):
                 gains = read_csv(sequence_folder(folder, self.sequences, number) / "gains.csv")
-                lines += [(number, line) for line in gains]
+                lines += [(name, line) for line in gains]
             lines.sort(key=lambda line: int(line[1]["place"]))
-            self.queries = [line["query"] for _, line in lines]
-            self.sequence_of = np.array([number for number, _ in lines], int)
+            self.queries, self.sequence_of = [line["query"] for _, line in lines], np.array([name for name, _ in lines])
             ranks = {name: [line[f"{name} rank"] or 0 for _, line in lines] for name in self.systems if lines}
             self.ranks = {name: np.array(column, int) for name, column in ranks.items()}
 
-    def hits(self, system: str, k: int = 1, sequence: int | None = None) -> Bool[np.ndarray, " queries"]:
-        """Along the path, whether one of the first k candidates is correct; `sequence` None = of all."""
-        hits = (self.ranks[system] > 0) & (self.ranks[system] <= k)
-        return hits if sequence is None else hits[self.sequence_of == sequence]
+    def hits(self, system: str, k: int = 1) -> Bool[np.ndarray, " queries"]:
+        """Along the path, whether one of the first k candidates is correct."""
+        return (self.ranks[system] > 0) & (self.ranks[system] <= k)
 
-    def recall(self, system: str, part: str = _POOLED) -> Estimate:
-        """Recall at 1 of a part, and its 95 % interval."""
-        return estimate(self.hits(system, 1, self.parts[part]))
+    def recall(self, system: str, sequence: str = _POOLED) -> Estimate:
+        """Recall at 1 of a sequence, or of all queries, and its 95 % interval."""
+        hits = self.hits(system)
+        return estimate(hits if sequence == _POOLED else hits[self.sequence_of == sequence])
 
     def predictions(self) -> Iterator[dict[str, str]]:
         """The first candidates of all systems for each query that has one, those of the system that decides first.
@@ -297,11 +291,11 @@ def _recall(runs: Mapping[str, Run], curves: Curves) -> dict[str, Any]:
     groups = {"recall": {name: run.recall(system) for name, (run, system) in curves.items()}}
     for label, run in runs.items():
         for row in run.tables["table"]:
-            if (sequence := row.get("sequence", _POOLED)) in run.parts:  # the plain mean has no interval
+            if (sequence := row.get("sequence", _POOLED)) != MEANS[0]:  # the plain mean has no interval
                 row[f"R@1{run.within}, 95 %"] = format_interval(run.recall(row["system"], sequence).interval)
             rows.append({"run": label} | row if label else row)
         if len(run.sequences) > 1 and len(runs) == 1:
-            groups = {name: {part: run.recall(name, part) for part in run.parts} for name in curves}
+            groups = {name: {part: run.recall(name, part) for part in (*run.sequences, _POOLED)} for name in curves}
     bars = {
         name: [(member, 100 * bar.recall, [100 * end for end in bar.interval]) for member, bar in group.items()]
         for name, group in groups.items()

@@ -16,7 +16,7 @@ from mfvpr.io.containers import reading, shorten
 from mfvpr.io.shortlists import write_shortlist
 from mfvpr.io.trajectories import SECOND, read_poses, write_trajectory
 from mfvpr.report.evaluations import NO_PLACE
-from mfvpr.report.tables import read_csv, write_csv
+from mfvpr.report.runs import read_csv, write_csv
 from mfvpr.utils.errors import InputError
 from mfvpr.utils.files import require_replaceable
 

@@ -19,8 +19,7 @@ from mfvpr.report.pages import write_comparison
 from mfvpr.report.pages import write_report as write_page
 from mfvpr.report.prediction_files import CandidateLayout, write_candidates
 from mfvpr.report.run_files import save_run
-from mfvpr.report.runs import claim_run_folder, file_names, write_table
-from mfvpr.report.tables import Table, data_frame
+from mfvpr.report.runs import Table, claim_run_folder, data_frame, file_names, write_table
 from mfvpr.storage.feature_cache import FeatureCache
 from mfvpr.utils.errors import InputError
 from mfvpr.utils.runtime import Runtime

@@ -18,8 +18,7 @@ from mfvpr.evaluation.rankings import Fusion, Ranked
 from mfvpr.evaluation.stages import Scales, dominant_shifts
 from mfvpr.evaluation.statistics import mcnemar, path_test
 from mfvpr.report.evaluations import NO_PLACE, EvaluationReport, confidence_table, recall_table
-from mfvpr.report.runs import file_names, write_about, write_json, write_table, writing
-from mfvpr.report.tables import write_csv
+from mfvpr.report.runs import file_names, write_about, write_csv, write_json, write_table, writing
 from mfvpr.storage.feature_cache import FeatureCache
 from mfvpr.utils.fingerprints import versions
 
@@ -28,44 +27,39 @@ SHIFTS = ("shift_x", "shift_y", "low_x", "high_x", "low_y", "high_y", "width", "
 
 @dataclass(frozen=True)
 class RunDescription:
-    """Settings of an evaluation, as JSON values for its run folder.
+    """Settings of an evaluation, as JSON values for its run folder."""
 
-    Attributes:
-        truth: kind, files, unit and thresholds of the ground truth; `truth_words` say the same in headings.
-        contents: of the image files, by side.
-        settings: that scores depend on, "retrieval", "features", "matching", "scorer" and maybe "fusion" among them.
-    """
-
-    truth: Mapping[str, Any]
-    truth_words: str
-    contents: Mapping[str, Contents]
-    settings: Mapping[str, Any]
+    truth: Mapping[str, Any]  # kind, files, unit and thresholds of the ground truth
+    truth_words: str  # the same in headings
+    contents: Mapping[str, Contents]  # of the image files, by side
+    settings: Mapping[str, Any]  # "retrieval", "features", "matching", "scorer", and others that scores depend on
     command: str | None = None
 
 
 def _parameters(report: EvaluationReport, settings: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
-    """Parameters by final score: of its scorers, or of the fusion or the sequence that makes it of others."""
-    scorers, by_name = settings["scorer"], dict[str, dict[str, Any]]()
+    """Scorers of each final score, and their parameters, with those of its fusion or sequence."""
+    scorers, about = settings["scorer"], dict[str, dict[str, Any]]()
     for score in report.ranked.system.final_scores.values():
-        values = by_name[score.base] if score.base else {**scorers.get(score.name, {})}
+        values = about[score.base]["parameters"] if score.base else {**scorers.get(score.name, {})}
         if isinstance(score.step, Fusion) and len(score.scorers) > 1:
             values = {name: scorers[name] for name in score.scorers}
         if isinstance(score.step, Fusion) and "fusion" in settings:
             values = values | settings["fusion"]
         elif score.step is not None:
             values = values | asdict(score.step)
-        by_name[score.name] = values
-    return by_name
+        about[score.name] = {"scorer": " + ".join(score.scorers) or "none", "parameters": values}
+    return about
 
 
 def heading(report: EvaluationReport, description: RunDescription) -> str:
     """Data set, numbers of images, retrieval, features and ground truth in one line."""
     dataset, settings = report.ranked.dataset, description.settings
+    candidates = num_candidates(report.ranked.system.pipeline.candidates, dataset.database)
     several = f" in {len(dataset.sequences)} sequences" if len(dataset.sequences) > 1 else ""
     incomplete = " (incomplete)" if any(published_differences(dataset)) else ""
     return (
         f"{dataset.name}{incomplete}: {len(report.queries)} queries{several}, {len(dataset.database)} database images, "
-        f"{_num_candidates(report)} candidates ({settings['retrieval']['name']}), {matched_content(settings)}; "
+        f"{candidates} candidates ({settings['retrieval']['name']}), {matched_content(settings)}; "
         f"{description.truth_words}"
     )
 
@@ -77,10 +71,6 @@ def matched_content(settings: Mapping[str, Any]) -> str:
         return "imported matches"
     is_of_images = matching.get("inputs") == "images"
     return f"matches of {matching['name']}" if is_of_images else f"{settings['features']['name']} features"
-
-
-def _num_candidates(report: EvaluationReport) -> int:
-    return num_candidates(report.ranked.system.pipeline.candidates, report.ranked.dataset.database)
 
 
 def ground_truth(report: EvaluationReport, description: RunDescription) -> dict[str, Any]:
@@ -128,7 +118,7 @@ def write_run_folder(folder: Path, report: EvaluationReport, description: RunDes
     """Write all files of a run folder but run.json and the figures."""
     dataset, truth, rows = report.ranked.dataset, report.truth, report.rows()
     common = {
-        "candidates": _num_candidates(report),
+        "candidates": num_candidates(report.ranked.system.pipeline.candidates, dataset.database),
         "queries": len(report.queries),
         "dataset": dataset.name,
         "data_fingerprint": fingerprints(description.contents),
@@ -145,11 +135,8 @@ def write_run_folder(folder: Path, report: EvaluationReport, description: RunDes
     }
     lines, parameters = [], _parameters(report, description.settings)
     for row in rows:
-        name = row["system"]
-        scorers = " + ".join(report.ranked.system.final_scores[name].scorers)
-        about = {"scorer": scorers or "none", "parameters": parameters[name]}
         recall_at = {str(k): round(recall, 6) for k, recall in row["recall_at"].items()}
-        lines.append(row | {"recall_at": recall_at} | about | results)
+        lines.append(row | {"recall_at": recall_at} | parameters[row["system"]] | results)
     write_json(folder / "results.json", lines)
     _write_rankings(folder, report)
     _write_shifts(folder, report)
@@ -267,7 +254,7 @@ def _write_top_predictions(folder: Path, report: EvaluationReport) -> None:
     correct = None if positives is None else report.hits(name)
     outcomes = np.full(count, "") if correct is None else np.where(correct, "correct", "incorrect")
     # Rounding may move a confidence to another bin.
-    both = [["" if np.isnan(p) else repr(p) for p in values.tolist()] for values in report.both_probabilities[name]]
+    both = [["" if np.isnan(p) else repr(p) for p in values.tolist()] for values in report.probabilities[name]]
     columns = {
         "prediction": np.where(is_refused, NO_PLACE, images),
         "refused": np.where(is_refused, images, ""),

@@ -20,8 +20,7 @@ from mfvpr.datasets.ground_truth import threshold_words
 from mfvpr.evaluation.statistics import Estimate, mcnemar, path_test, recall_interval
 from mfvpr.report import runs
 from mfvpr.report.figures import panels, save_figure
-from mfvpr.report.runs import Figure, file_names
-from mfvpr.report.tables import Table, data_frame, format_estimate, format_interval, format_value, format_values
+from mfvpr.report.runs import Figure, Table, format_estimate, format_interval, format_value, format_values
 from mfvpr.tuning.sweeps.setting_search import Outcome
 from mfvpr.utils.errors import InputError
 from mfvpr.utils.files import write_text
@@ -88,7 +87,7 @@ class Sweep:
         """A row per setting: its values, and recall as fractions; needs pandas."""
         header, recalls = _recalls(self.outcome)
         rows = zip(self.outcome.settings, recalls.tolist(), strict=True)
-        return data_frame([{**setting, **dict(zip(header, recall, strict=True))} for setting, recall in rows])
+        return runs.data_frame([{**setting, **dict(zip(header, recall, strict=True))} for setting, recall in rows])
 
     def plot(self, *names: str) -> Canvas:
         """A heat map of recall@1 over one or two axes, the other axes at the best setting: `plot("sigma", "weight")`.
@@ -202,7 +201,7 @@ def sweep_figures(outcome: Outcome) -> list[Figure]:
     """Heat maps of every pair of axes with several values; none of a search that tried no complete grid."""
     names = [name for name, axis in outcome.axes.values.items() if len(axis) > 1 and outcome.is_grid]
     pairs = list(itertools.combinations(names, 2)) or [("", name) for name in names]
-    files = file_names([" + ".join(filter(None, pair)) for pair in pairs[:_MAX_HEAT_MAPS]]).values()
+    files = runs.file_names([" + ".join(filter(None, pair)) for pair in pairs[:_MAX_HEAT_MAPS]]).values()
 
     def draw(path: Path, pair: tuple[str, str]) -> None:
         save_figure(_heat_map(outcome, *pair), path)

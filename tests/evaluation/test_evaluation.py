@@ -18,7 +18,7 @@ from mfvpr.features import Aggregated, Sift, VladFitting
 from mfvpr.io import write_features, write_global_descriptors, write_shortlist
 from mfvpr.report.evaluations import EvaluationReport, recall_table
 from mfvpr.report.run_files import write_gains
-from mfvpr.report.tables import read_csv
+from mfvpr.report.runs import read_csv
 from mfvpr.retrieval import DescriptorFiles, FeatureFiles, Retrieval, ShortlistFiles
 from mfvpr.retrieval.precomputed import File
 from mfvpr.storage import FeatureCache
