@@ -1,7 +1,7 @@
 """Functions of arrays that are exported: scores of matches, or of the features of a query and its candidates."""
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from functools import partial
 from typing import Any, Literal, NamedTuple
 
@@ -20,37 +20,11 @@ from mfvpr.utils.fields import COUNT, POSITIVE, list_of
 
 Form = Literal["vectorized", "loop"]
 
-FIELDS = {
-    "points0": ("CK2", "float32", "px"),
-    "points1": ("CK2", "float32", "px"),
-    "distance": ("CK", "float32", ""),
-    "scores0": ("CK", "float32", ""),
-    "scores1": ("CK", "float32", ""),
-    "mask": ("CK", "bool", ""),
-    "image_size0": ("2", "float32", "px"),
-    "image_size1": ("C2", "float32", "px"),
-    "ratio": ("CK", "float32", ""),
-    "confidence": ("CK", "float32", ""),
-    "index0": ("CK", "int32", ""),
-    "index1": ("CK", "int32", ""),
-    "count0": ("", "int32", ""),
-    "count1": ("C", "int32", ""),
-}
-"""Axes, type and unit of the inputs of a scorer: the fields of `Matches`, those of the query without the axis C."""
-
-_FEATURES = {
-    "keypoints": ("K2", "float32", "px"),
-    "descriptors": ("KD", "float32", ""),
-    "scores": ("K", "float32", ""),
-    "mask": ("K", "bool", ""),
-    "image_size": ("2", "float32", "px"),
-}
-FEATURES = {
-    f"{name}{side}": (first + axes, dtype, unit)
-    for side, first in (("0", ""), ("1", "C"))
-    for name, (axes, dtype, unit) in _FEATURES.items()
-}
-"""Axes, type and unit of the inputs of a system: the fields of `Features` of the query (0) and the candidates (1)."""
+# Axes, types and units of the fields of `Matches` and `Features`, without 0 and 1 and the candidates' axis C.
+_AXES = {"points": "K2", "keypoints": "K2", "descriptors": "KD", "image_size": "2", "count": ""}  # others: "K"
+_TYPES = {"mask": "bool", "index": "int32", "count": "int32"}  # others: "float32"
+_PIXELS = ("points", "keypoints", "image_size", "shift")
+_OF_QUERY = ("image_size0", "count0")  # fields of matches that all candidates share
 
 
 @dataclass(frozen=True)
@@ -86,6 +60,14 @@ class Tensor(NamedTuple):
     unit: str
     axes: str
 
+    @classmethod
+    def of(cls, name: str, axes: str, shapes: ExportShapes) -> "Tensor":
+        """The tensor of a name with these axes."""
+        lengths = {"C": shapes.candidates, "K": shapes.keypoints, "D": shapes.dimension or 0, "2": 2}
+        field = name.rstrip("01")
+        shape = tuple(lengths[axis] for axis in axes)
+        return cls(name, shape, _TYPES.get(field, "float32"), "px" if field in _PIXELS else "", axes)
+
 
 @dataclass(frozen=True)
 class Program:
@@ -117,10 +99,13 @@ def make_program(
     """
     matcher: Any = None
     left_out: tuple[str, ...] = ()
-    table = {name: field for name, field in FIELDS.items() if with_confidence or name != "confidence"}
+    names = [each.name for each in fields(Matches) if with_confidence or each.name != "confidence"]
+    table = {name: "C" * (name not in _OF_QUERY) + _AXES.get(name.rstrip("01"), "K") for name in names}
+    of_features = [each.name for each in fields(Features)]
     scorers: dict[str, Scorer]
     if isinstance(method, System):
-        table, matcher, main = FEATURES, method.pipeline.matcher, method.headline
+        matcher, main, sides = method.pipeline.matcher, method.headline, {"0": "", "1": "C"}.items()
+        table = {f"{name}{side}": first + _AXES.get(name, "K") for side, first in sides for name in of_features}
         shapes = replace(shapes, dimension=_dimension(method, shapes))
         if with_confidence:
             raise InputError("with_confidence=True: expected a scorer, got a system, whose matcher gives confidences")
@@ -154,27 +139,20 @@ def make_program(
         return tuple(values.astype(jnp.float32) for values in (*scores, *shift))
 
     def score_matches(arrays: dict[str, Array], form: Form) -> tuple[Array, ...]:
-        of_query = {name: arrays[name] for name in ("image_size0", "count0")}
+        of_query = {name: arrays[name] for name in _OF_QUERY}
         copies = {name: jnp.broadcast_to(each, (shapes.candidates, *each.shape)) for name, each in of_query.items()}
         return _over(score, Matches(**(arrays | copies)), form)
 
     def score_features(arrays: dict[str, Array], form: Form) -> tuple[Array, ...]:
-        query, candidates = (Features(**{name: arrays[f"{name}{side}"] for name in _FEATURES}) for side in "01")
+        query, candidates = (Features(**{name: arrays[f"{name}{side}"] for name in of_features}) for side in "01")
         match: Callable[[Features], Matches] = partial(matcher, query)
         if form == "loop":
             return _over(lambda candidate: score(match(candidate)), candidates, form)
         return jax.vmap(score)(jax.lax.map(match, candidates))  # one similarity matrix at a time
 
-    output_table = {name: ("C", "float32", "") for name in scorers}
-    output_table |= {"shift": ("C2", "float32", "px")} if with_shift else {}
-    lengths = {"C": shapes.candidates, "K": shapes.keypoints, "D": shapes.dimension or 0, "2": 2}
-    inputs, outputs = (
-        tuple(
-            Tensor(name, tuple(lengths[axis] for axis in axes), dtype, unit, axes)
-            for name, (axes, dtype, unit) in tensors.items()
-        )
-        for tensors in (table, output_table)
-    )
+    inputs = tuple(Tensor.of(name, axes, shapes) for name, axes in table.items())
+    outputs = tuple(Tensor.of(name, "C", shapes) for name in scorers)
+    outputs += (Tensor.of("shift", "C2", shapes),) if with_shift else ()
     parts = scorers if matcher is None else {**scorers, "matcher": matcher}
     return Program(shapes, inputs, outputs, score_features if matcher else score_matches, parts, left_out)
 

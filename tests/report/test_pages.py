@@ -59,7 +59,8 @@ class Parsed(HTMLParser):
 
     @property
     def charts(self):
-        return json.loads(self.scripts[0], parse_constant=lambda word: pytest.fail(f"{word} is not JSON"))
+        charts = json.loads(self.scripts[0], parse_constant=lambda word: pytest.fail(f"{word} is not JSON"))
+        return {chart["name"]: chart for chart in charts}
 
 
 def text_on_page(text):

@@ -70,7 +70,7 @@ function isDark() {
 
 function paint() {
   theme.textContent = isDark() ? "Light" : "Dark";
-  for (const name of Object.keys(charts)) Plotly.update(`chart-${name}`, ...colors());
+  for (const { name } of charts) Plotly.update(`chart-${name}`, ...colors());
 }
 
 theme.hidden = false;
@@ -121,7 +121,7 @@ function bar([name, members], place, groups) {
   };
 }
 
-const drawn = Object.entries(charts).map(([name, { kind, scale, axes, data }]) => {
+const drawn = charts.map(({ name, kind, scale, axes, data }) => {
   const isBars = kind === "bars";
   const bars = isBars ? data.reduce((sum, [, members]) => sum + members.length, 0) : 0;
   const layout = {
