@@ -31,19 +31,15 @@ _OF_QUERY = ("image_size0", "count0")  # fields of matches that all candidates s
 class ExportShapes:
     """Sizes of the arrays of an exported program, which are fixed; an `InputError` unless they are above 0.
 
-        mfvpr.ExportShapes(candidates=50, keypoints=800, image_size=(640, 480))
+        shapes = mfvpr.ExportShapes(candidates=50, keypoints=800, image_size=(640, 480))
 
-    Attributes:
-        candidates: C, of one query; fill up with candidates whose mask is False.
-        keypoints: K, of each image; of a scorer alone: match slots of each pair.
-        image_size: largest (width, height) of an image, px; the capacities of histograms follow from it.
-        dimension: D, of a descriptor; None = the extractor's. A scorer alone has no descriptors.
+    A scorer alone has no descriptors.
     """
 
-    candidates: int
-    keypoints: int
-    image_size: tuple[float, float]
-    dimension: int | None = None
+    candidates: int  # C, of one query; fill up with candidates whose mask is False
+    keypoints: int  # K, of each image; of a scorer alone: match slots of each pair
+    image_size: tuple[float, float]  # largest (width, height), px; the capacities of histograms follow from it
+    dimension: int | None = None  # D, of a descriptor; None = the extractor's
 
     def __post_init__(self) -> None:
         rules = {"candidates": COUNT, "keypoints": COUNT, "image_size": list_of(POSITIVE, 2), "dimension": COUNT | None}
@@ -92,17 +88,15 @@ class Program:
 def make_program(
     method: Scorer | System, shapes: ExportShapes, *, with_shift: bool, with_confidence: bool = False
 ) -> Program:
-    """The program of a scorer or of a system, with the capacities that images of this size need.
+    """The program of a scorer, or of all scorers of a system, with the capacities that images of this size need.
 
-    A system returns the scores of all of its scorers, first those of the scorer that decides. An `InputError` says why
-    a method cannot be exported.
+    The scores of the scorer that decides come first. An `InputError` says why a method cannot be exported.
     """
     matcher: Any = None
-    left_out: tuple[str, ...] = ()
+    scorers, left_out = {"scores": method}, ()
     names = [each.name for each in fields(Matches) if with_confidence or each.name != "confidence"]
     table = {name: "C" * (name not in _OF_QUERY) + _AXES.get(name.rstrip("01"), "K") for name in names}
     of_features = [each.name for each in fields(Features)]
-    scorers: dict[str, Scorer]
     if isinstance(method, System):
         matcher, main, sides = method.pipeline.matcher, method.headline, {"0": "", "1": "C"}.items()
         table = {f"{name}{side}": first + _AXES.get(name, "K") for side, first in sides for name in of_features}
@@ -115,8 +109,6 @@ def make_program(
         scorers = {"scores": method.scorers[main]}
         scorers |= {f"scores_{name}": scorer for name, scorer in method.scorers.items() if name != main}
         left_out = tuple(name for name in method.final_scores if name not in method.scorers)
-    else:
-        scorers = {"scores": method}
     for name, scorer in scorers.items():
         if on_host(scorer):
             kind, expected = type(scorer).__name__, "a scorer that JAX compiles, not on the host (score_pairs)"
