@@ -28,25 +28,15 @@ _UNITS: Mapping[str, Unit] = {"tolerance": "frames", "radius": "m"}  # of a thre
 
 @dataclass(frozen=True)
 class EvaluationReport:
-    """Rankings of a data set by a system, and the criteria of their report; arrays are of Q queries.
-
-    Attributes:
-        ranked: rankings of all sequences.
-        thresholds: distances within which a prediction is correct, sorted; empty = the default of the programs, or none
-            without ground truth.
-        ks: depths of recall, sorted.
-        confidences: by system, fitted on other images; None = with ground truth, each half of the path has the
-            confidence that was fitted on the other half.
-        least_confidence: below which the prediction is `NO_PLACE`; None = no prediction is refused.
-        lacking: by sequence, why evidence is lacking for predictions of the system that decides, which are then
-            `NO_PLACE`, see `mfvpr.evaluation.evidence`; None = not tested.
-    """
+    """Rankings of a data set by a system, and the criteria of their report; arrays are of Q queries."""
 
     ranked: RankedDataset
-    thresholds: Sequence[float] = ()
-    ks: Sequence[int] = KS
+    thresholds: Sequence[float] = ()  # of a correct prediction, sorted; empty = the default of the programs
+    ks: Sequence[int] = KS  # depths of recall, sorted
+    # By system, fitted on other images; None = with ground truth, each half of the path has a fit on the other half.
     confidences: Mapping[str, Confidence] | None = None
-    least_confidence: float | None = None
+    least_confidence: float | None = None  # below which the prediction is `NO_PLACE`; None = none is refused
+    # By sequence, why evidence is lacking for predictions of the system that decides, which are then `NO_PLACE`.
     lacking: Sequence[Sequence[Reason | None]] | None = None
 
     def __post_init__(self) -> None:
@@ -56,7 +46,7 @@ class EvaluationReport:
 
     @property
     def headline(self) -> str:
-        """The final score that decides, in predictions.csv and in figures."""
+        """The final score that decides."""
         return self.ranked.system.headline
 
     @property
@@ -84,8 +74,7 @@ class EvaluationReport:
     def rows(self) -> list[dict[str, Any]]:
         """Recall by K of every system, threshold and sequence; behind several sequences, of their means.
 
-        A row has "system" and "decides", with several sequences "sequence", the "tolerance" or "radius", and
-        "recall_at", which is empty without ground truth.
+        "sequence" is there if there are several; "recall_at" is empty without ground truth.
         """
         truth, rows = self.truth, list[dict[str, Any]]()
         if truth is None:
@@ -241,8 +230,7 @@ def recall_table(rows: Iterable[Mapping[str, Any]]) -> Table:
 def confidence_table(evaluation: EvaluationReport) -> Table:
     """Average precision, recall at 100 and 99 % precision, by score and by confidence; calibration; all in percent.
 
-    "ECE" is the expected calibration error of the queries as they are, "by chance" that of a perfectly calibrated
-    confidence. "ECE with absent" counts each query once more without the images of its place, as the fits do. With
+    "ECE with absent" counts each query once more without the images of its place, as the fits do. With
     `least_confidence`, counts of queries follow.
     """
     is_refusing, rows = evaluation.least_confidence is not None, []

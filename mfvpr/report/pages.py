@@ -44,21 +44,12 @@ _SEARCH_TABLES = {"rows": "All scores", "axes": "All settings", "jobs": "All job
 _IN_TABLES = {"settings", "rows", "queries", "report", "jobs"}  # names in results.json
 
 
-def write_page(
-    path: Path,
-    template: str = "sections.html",
-    *,
-    title: str,
-    words: str,
-    facts: Mapping[str, str],
-    charts: Sequence[Mapping[str, Any]] = (),
-    **content: Any,
-) -> None:
+def write_page(path: Path, template: str = "sections.html", **content: Any) -> None:
     """Write one HTML file; the same bytes for the same values. An earlier page is replaced; InputError for other files.
 
-    `words` stand below the title; `facts` are the most important values, by name; `content` is the template's. That of
-    sections.html are `parts`, by title: the `words`, `links`, `text`, `images` and `tables` of each, as far as it has
-    them. Links are words and relative addresses, images `data:` URIs by name, and tables are by caption.
+    Every page has a `title`, `words` below it, and `facts`, the most important values by name. sections.html has
+    `parts`, by title: the `words`, `links`, `text`, `images` and `tables` of each, as far as it has them. Links are
+    words and relative addresses, images `data:` URIs by name, and tables are by caption.
     """
     require_replaceable(path, _POLICY)
     from jinja2 import Environment, FileSystemLoader, StrictUndefined
@@ -72,14 +63,10 @@ def write_page(
     scripts = [get_plotlyjs(), (_TEMPLATES / "script.js").read_text("utf-8")]
     hashes = [b64encode(sha256(script.encode()).digest()).decode() for script in scripts]
     text = environment.get_template(template).render(
-        title=title,
-        words=words,
-        facts=facts,
-        charts=charts,
+        {"recall": None, "charts": [], **content},
         scripts=map(Markup, scripts),  # of this package and of plotly, as is the style
         style=Markup((_TEMPLATES / "style.css").read_text("utf-8")),
         hashes=" ".join(f"'sha256-{each}'" for each in hashes),
-        **content,
     )
     write_text(path, text)
 
@@ -193,7 +180,7 @@ def write_report(folder: Path, path: Path | None = None) -> Path:
         _write_search_page(folder, results, path)
         return path
     run = Run(folder)
-    common, facts, recall = run.common, {"decides": run.headline}, {"recall": None, "charts": []}
+    common, facts, recall = run.common, {"decides": run.headline}, dict[str, Any]()
     if run.queries:
         recall = _recall({"": run}, {name: (run, name) for name in run.systems})
         for name in (run.headline, RETRIEVAL):
@@ -246,7 +233,7 @@ def write_comparison(folders: Sequence[Path], path: Path) -> None:
         about = {name: run.about.get(name) for name in ("command", "commit", "settings", "ground_truth")}
         about |= {name: run.common[name] for name in ("data_fingerprint", "versions", "seconds")}
         settings[label] = dict(flat(about))
-    header, recall = ["run", "data set", "decides", "what was evaluated"], {"recall": None, "charts": []}
+    header, recall = ["run", "data set", "decides", "what was evaluated"], dict[str, Any]()
     if known := {label: run for label, run in runs.items() if run.queries}:
         recall = _recall(known, {f"{label}: {run.headline}": (run, run.headline) for label, run in known.items()})
     names = dict.fromkeys(name for values in settings.values() for name in values)
@@ -282,7 +269,7 @@ def _write_search_page(folder: Path, results: Mapping[str, Any], path: Path) -> 
 # --- recall of runs with ground truth ----------------------------------------------------------------------------
 
 Curves = Mapping[str, tuple[Run, str]]  # a run and one of its systems, by the name of their curve
-Chart = dict[str, Any]  # for script.js: "lines" of points (x, y in %) by name, or "bars" with intervals by their group
+Chart = dict[str, Any]  # for script.js: points (x, y in %) by the name of their curve, or bars by that of their group
 
 
 def _recall(runs: Mapping[str, Run], curves: Curves) -> dict[str, Any]:
@@ -303,7 +290,7 @@ def _recall(runs: Mapping[str, Run], curves: Curves) -> dict[str, Any]:
     intervals = {"name": "intervals", "title": "Recall at 1, with intervals", "axes": ("recall at 1, %", "")}
     confidences = {label: run.tables["confidence"] for label, run in runs.items()}
     charts = [
-        intervals | {"kind": "bars", "scale": "share", "data": [*bars.items()]},
+        intervals | {"scale": "share", "data": [*bars.items()]},
         _tolerance_chart(curves),
         _depths_chart(curves),
         *(_precision_chart(curves, by) for by in ("score", "confidence")),
@@ -324,8 +311,7 @@ def _depths_chart(curves: Curves) -> Chart:
         depths = np.unique(np.geomspace(1, largest, _CURVE_POINTS).round().astype(int)).tolist()
         points[name] = [(k, 100 * float(run.hits(system, k).mean())) for k in depths]
     axes = "K, the first candidates", "recall at K, %"
-    chart = {"name": "depths", "title": "Recall over K", "axes": axes}
-    return chart | {"kind": "lines", "scale": "log", "data": [*points.items()]}
+    return {"name": "depths", "title": "Recall over K", "axes": axes, "scale": "log", "data": [*points.items()]}
 
 
 def _tolerance_chart(curves: Curves) -> Chart:
@@ -339,7 +325,7 @@ def _tolerance_chart(curves: Curves) -> Chart:
             points[name] = [(at, 100 * recall) for at, recall in zip(run.thresholds, recalls, strict=True)]
     axes = f"tolerance, {unit}", f"recall at {k}, %"
     chart = {"name": "tolerances", "title": "Recall over tolerance", "axes": axes}
-    return chart | {"kind": "lines", "scale": "linear", "data": [*points.items()]}
+    return chart | {"scale": "linear", "data": [*points.items()]}
 
 
 def _precision_chart(curves: Curves, by: str) -> Chart:
@@ -354,15 +340,20 @@ def _precision_chart(curves: Curves, by: str) -> Chart:
             points[f"{name}: AP {100 * curve.average_precision:.1f}"] = (100 * pairs).round(3).tolist()
     axes = "recall of queries with a correct image, %", "precision, %"
     chart = {"name": f"precision-{by}", "title": f"Precision and recall by {by}", "axes": axes}
-    return chart | {"kind": "lines", "scale": "percent", "data": [*points.items()]}
+    return chart | {"scale": "percent", "data": [*points.items()]}
 
 
 def _differences(curves: Curves) -> dict[str, Table]:
     """Tests of every two curves, query by query, and the pairs that cannot be compared."""
     rows, incomparable = [], []
     for (name, (run, system)), (other, (second, other_system)) in itertools.combinations(curves.items(), 2):
-        if reason := _incomparable_reason(run, second):
-            incomparable.append([name, other, reason])
+        differing = {
+            "other images": run.common["data_fingerprint"] != second.common["data_fingerprint"],
+            "another ground truth": run.common["ground_truth"] != second.common["ground_truth"],
+            "other queries": (run.queries, run.sequences) != (second.queries, second.sequences),
+        }
+        if any(differing.values()):
+            incomparable.append([name, other, next(words for words, differs in differing.items() if differs)])
             continue
         hits = run.hits(system), second.hits(other_system)
         test, path = mcnemar(*hits), path_test(*hits)
@@ -371,13 +362,3 @@ def _differences(curves: Curves) -> dict[str, Table]:
     header = ["system", "other", "only system", "only other", "McNemar p", "queries worth one", "p along the path"]
     reasons = Table(["run", "other", "why"], incomparable, text_columns=3)
     return {"differences": Table(header, rows, text_columns=2), "incomparable": reasons}
-
-
-def _incomparable_reason(first: Run, second: Run) -> str | None:
-    """The reason that two runs with ground truth cannot be compared query by query; None = they can."""
-    if first.common["data_fingerprint"] != second.common["data_fingerprint"]:
-        return "other images"
-    if first.common["ground_truth"] != second.common["ground_truth"]:
-        return "another ground truth"
-    same = first.queries == second.queries and first.sequences == second.sequences
-    return None if same else "other queries"

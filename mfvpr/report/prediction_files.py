@@ -29,16 +29,12 @@ _FRAME = "camera"  # header.frame_id
 
 @dataclass(frozen=True)
 class LocalizedImage:
-    """A query with its prediction.
-
-    `place` is any JSON value, None = no place. `candidates` are names of database images and their scores, best first;
-    empty without a place. `cells` are of the table of shifts, by column.
-    """
+    """A query with its prediction."""
 
     name: str
-    place: Any = None
-    candidates: Sequence[tuple[str, float]] = ()
-    cells: Mapping[str, str] = field(default_factory=dict)
+    place: Any = None  # any JSON value; None = no place
+    candidates: Sequence[tuple[str, float]] = ()  # names of database images and scores, best first; none without place
+    cells: Mapping[str, str] = field(default_factory=dict)  # of the table of shifts, by column
 
 
 def write_candidates(

@@ -1,7 +1,4 @@
-"""Evaluation in one call, and its result: tables, predictions, run folders and a page.
-
-`mfvpr.evaluation.rank_dataset` ranks; this module reports.
-"""
+"""Evaluation in one call, and its result: tables, predictions, run folders and a page."""
 
 import math
 import tempfile
@@ -31,18 +28,15 @@ Thresholds = Sequence[float] | None
 
 
 class TopPrediction(NamedTuple):
-    """The first candidate of a query, by names; without a candidate, it is None and its score NaN.
-
-    `is_correct` is that within the middle threshold, and None without ground truth.
-    """
+    """The first candidate of a query, by names."""
 
     dataset: str
     system: str
     sequence: str
     query: str
-    prediction: str | None
-    score: float
-    is_correct: bool | None
+    prediction: str | None  # None = no candidate
+    score: float  # NaN without a candidate
+    is_correct: bool | None  # within the middle threshold; None without ground truth
 
 
 def evaluate(
@@ -87,14 +81,10 @@ class Result:
 
     `thresholds` are largest distances of a correct prediction in the unit of the ground truth, `ks` depths of recall.
     The defaults are those of the programs: 1, 2 and 5 frames or 25 m, and 1, 5 and 10.
-
-    Attributes:
-        parts: by names of the data set and of the system; a system without a name has that of its final score.
-        cache: of the evaluation.
     """
 
-    parts: Mapping[tuple[str, str], RankedDataset]
-    cache: FeatureCache
+    parts: Mapping[tuple[str, str], RankedDataset]  # by names of the data set, and of the system or its final score
+    cache: FeatureCache  # of the evaluation
 
     def __repr__(self) -> str:
         return f"Result({'; '.join(map(', '.join, self._names))})"

@@ -142,7 +142,13 @@ def write_run_folder(folder: Path, report: EvaluationReport, description: RunDes
     _write_shifts(folder, report)
     if report.headline in report.probabilities:
         _write_top_predictions(folder, report)
-    _write_skipped(folder, report)
+    skipped, matched = list[tuple[str, str, str]](), report.ranked.matched
+    for row, reason in sorted({pair for part in matched for pair in part.bad_database.items()}):
+        skipped.append(("database", dataset.database.names[row], reason))
+    for part in matched:
+        skipped += [("queries", part.sequence.images.names[row], reason) for row, reason in part.bad_queries.items()]
+    if skipped:  # images that could not be used
+        write_csv(folder / "skipped.csv", ["folder", "image", "reason"], skipped)
     if truth is None:
         return
     write_table(folder, recall_table(rows), heading(report, description))
@@ -267,16 +273,6 @@ def _write_top_predictions(folder: Path, report: EvaluationReport) -> None:
         "in_database": _cells(None if positives is None else positives.counts > 0, count),
     }
     _write_queries(folder, report, "top_predictions.csv", columns)
-
-
-def _write_skipped(folder: Path, report: EvaluationReport) -> None:
-    """Write `skipped.csv` with images that could not be used and the reasons, if there are any."""
-    names, matched = report.ranked.dataset.database.names, report.ranked.matched
-    lines = sorted({("database", names[row], reason) for part in matched for row, reason in part.bad_database.items()})
-    for part in matched:
-        lines += [("queries", part.sequence.images.names[row], reason) for row, reason in part.bad_queries.items()]
-    if lines:
-        write_csv(folder / "skipped.csv", ["folder", "image", "reason"], lines)
 
 
 def write_gains(folder: Path, report: EvaluationReport) -> None:

@@ -110,7 +110,9 @@ def write_csv(path: Path, header: Sequence[str], lines: Iterable[Iterable[Any]])
     """
 
     def text(cell: Any) -> Any:
-        return cell if not isinstance(cell, float | np.floating) else "" if np.isnan(cell) else f"{cell:.7g}"
+        if isinstance(cell, float | np.floating):
+            return "" if np.isnan(cell) else f"{cell:.7g}"
+        return cell
 
     with replacing(path) as temporary:
         temporary.write_bytes(_csv([header, *(map(text, line) for line in lines)]).encode("utf-8", "surrogateescape"))
@@ -234,11 +236,11 @@ def add_job(multirun: Path, number: int, overrides: Mapping[str, str], run: Path
     """Add a finished run to the joint table in the folder of its multirun; jobs may end at the same time."""
     results = json.loads((run / LAST).read_text("utf-8"))
     if isinstance(results, dict) and "axes" in results:  # of a sweep, the chosen setting
-        row = {"system": results["scorer"]["method"]}
+        rows = [{"system": results["scorer"]["method"]}]
         for verdict in results["report"]:
-            column = f"R@1{threshold_words(results['unit'], verdict['threshold'])}"
-            row[column] = f"{100 * verdict['chosen']['recall']:.1f}"
-        rows = [row | {"chosen": " / ".join(map(format_values, results["chosen"]))}]
+            words = threshold_words(results["unit"], verdict["threshold"])
+            rows[0][f"R@1{words}"] = f"{100 * verdict['chosen']['recall']:.1f}"
+        rows[0]["chosen"] = " / ".join(map(format_values, results["chosen"]))
     elif (run / "table.csv").exists():
         table = read_csv(run / "table.csv")
         rows = [{"system" if name == "score" else name: cell for name, cell in row.items()} for row in table]
@@ -250,17 +252,15 @@ def add_job(multirun: Path, number: int, overrides: Mapping[str, str], run: Path
         known = json.loads((multirun / LAST).read_text("utf-8"))["jobs"] if (multirun / LAST).exists() else []
         jobs = sorted([*known, job], key=lambda job: job["job"])
         names = dict.fromkeys(name for job in jobs for name in job["overrides"] if name != "out")
-        columns = {name for job in jobs for row in job["rows"] for name in row}
-        differing = {
-            name: f"{name}=" if name in columns else name  # such as system, which is also a column of results
-            for name in names
-            if len({job["overrides"].get(name) for job in jobs}) > 1
-        }
+        of_results = {name for job in jobs for row in job["rows"] for name in row}
+        differing = [name for name in names if len({job["overrides"].get(name) for job in jobs}) > 1]
+        # Such as system, which is also a column of results.
+        columns = {name: f"{name}=" if name in of_results else name for name in differing}
         lines = []
         for each in jobs:
-            settings = {column: each["overrides"].get(name, "") for name, column in differing.items()}
+            settings = {column: each["overrides"].get(name, "") for name, column in columns.items()}
             lines += [{"job": str(each["job"])} | settings | row | {"run": each["run"]} for row in each["rows"]]
-        table = table_of(lines, ["job", *differing.values(), "system", "sequence"])
+        table = table_of(lines, ["job", *columns.values(), "system", "sequence"])
         write_table(multirun, table, f"{len(jobs)} jobs")
         write_json(multirun / LAST, {"jobs": jobs})
 
@@ -269,10 +269,7 @@ def file_names(names: Sequence[str]) -> dict[str, str]:
     """File names without suffix, by name; they differ even if the file system ignores case.
 
     A file name is the name with `_` for ` + `. It ends in a hash instead if the name is not safe on every file system,
-    too long, or the same as another.
-
-    Raises:
-        InputError: a name is repeated.
+    too long, or the same as another. An InputError if a name is repeated.
     """
     if repeated := [name for name, count in Counter(names).items() if count > 1]:
         raise InputError(f"names: expected different ones, got {repeated[0]} twice. Rename one.")

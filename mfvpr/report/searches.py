@@ -41,14 +41,11 @@ _MAX_HEAT_MAPS = 6
 
 @dataclass(frozen=True, repr=False)
 class Sweep:
-    """The result of `mfvpr.sweep`: recall by every setting, and the best one.
+    """The result of `mfvpr.sweep`: recall by every setting, and the best one."""
 
-    It has the names of the data set and of the scorer; `outcome` are the rankings by every setting.
-    """
-
-    dataset: str
-    scorer: str
-    outcome: Outcome
+    dataset: str  # its name
+    scorer: str  # its name
+    outcome: Outcome  # rankings by every setting
 
     def __repr__(self) -> str:
         recall = f"{_label(self.outcome)} in % {format_estimate(self.interval)}"
@@ -59,8 +56,7 @@ class Sweep:
     def best(self) -> dict[str, Any]:
         """The setting with the highest recall@1 on the queries to choose on, plain values by axis.
 
-        With `split="both"`, all queries choose it: it is the setting to use from now on. `chosen` has the settings that
-        each half chose.
+        With `split="both"`, all queries choose it: it is the setting to use from now on.
         """
         return dict(self.outcome.settings[self.outcome.best])
 
@@ -203,10 +199,10 @@ def sweep_figures(outcome: Outcome) -> list[Figure]:
     pairs = list(itertools.combinations(names, 2)) or [("", name) for name in names]
     files = runs.file_names([" + ".join(filter(None, pair)) for pair in pairs[:_MAX_HEAT_MAPS]]).values()
 
-    def draw(path: Path, pair: tuple[str, str]) -> None:
-        save_figure(_heat_map(outcome, *pair), path)
-
-    return [(f"{file}.png", partial(draw, pair=pair)) for pair, file in zip(pairs, files, strict=False)]
+    figures = list[Figure]()
+    for pair, file in zip(pairs, files, strict=False):
+        figures.append((f"{file}.png", lambda path, pair=pair: save_figure(_heat_map(outcome, *pair), path)))
+    return figures
 
 
 def _heat_map(outcome: Outcome, first: str, second: str) -> Canvas:

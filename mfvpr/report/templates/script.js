@@ -121,8 +121,8 @@ function bar([name, members], place, groups) {
   };
 }
 
-const drawn = charts.map(({ name, kind, scale, axes, data }) => {
-  const isBars = kind === "bars";
+const drawn = charts.map(({ name, scale, axes, data }) => {
+  const isBars = scale === "share";
   const bars = isBars ? data.reduce((sum, [, members]) => sum + members.length, 0) : 0;
   const layout = {
     ...look, height: Math.max(380, 100 + 16 * bars), showlegend: data.length > 1,
