@@ -23,7 +23,7 @@ from mfvpr.deployment.programs import ExportShapes, Program, Tensor, make_progra
 from mfvpr.evaluation.system import System
 from mfvpr.io.containers import reading
 from mfvpr.utils.errors import InputError
-from mfvpr.utils.files import require_file, write_text
+from mfvpr.utils.files import write_text
 from mfvpr.utils.fingerprints import recipe_of, versions
 from mfvpr.utils.numerics import as_array
 
@@ -35,18 +35,12 @@ TOLERANCE = 1e-4  # of ONNX Runtime, which sums in another order: relative to ou
 
 @dataclass(frozen=True)
 class ExportedProgram:
-    """A program of a folder. Call it with an array for each input.
-
-        program = mfvpr.load_exported("exported")
-        scores = program(**arrays)["scores"]  # arrays as program.inputs says
-
-    `description` is the content of `export.json`.
-    """
+    """A program of a folder, called with an array for each input: `program(**arrays)["scores"]`."""
 
     folder: Path
     inputs: tuple[Tensor, ...]  # name, shape, dtype, unit and axes of each array that the program takes
     outputs: tuple[Tensor, ...]  # the same of each array that it returns
-    description: Mapping[str, Any] = field(repr=False)
+    description: Mapping[str, Any] = field(repr=False)  # content of `export.json`
     run: Callable[..., tuple[Array, ...]] = field(repr=False)
 
     def __call__(self, **arrays: Any) -> dict[str, np.ndarray]:
@@ -110,7 +104,7 @@ def export(
         program = without_unused_inputs(program)
         content = bytes(export_program(program).serialize())
         inputs = check_inputs(program)
-        values = jax.jit(deserialize(content, str(folder)).call)(*inputs.values())
+        values = jax.jit(jax_export.deserialize(bytearray(content)).call)(*inputs.values())
         outputs = {each.name: np.asarray(array) for each, array in zip(program.outputs, values, strict=True)}
         model, onnx_note = None, {"missing": "not requested" if onnx is False else "jax2onnx is not installed"}
         if onnx or (onnx is None and find_spec("jax2onnx")):
@@ -159,15 +153,14 @@ def load_exported(folder: Path | str) -> ExportedProgram:
     An `InputError` if a file is missing, or if this version of JAX cannot read the program.
     """
     folder = Path(folder)
-    require_file(path := folder / DESCRIPTION, "a folder of mfvpr.export with this file")
-    require_file(folder / PROGRAM)
-    with reading(path, mend="export it again"):
-        description = json.loads(path.read_text(encoding="utf-8"))
+    with reading(folder / DESCRIPTION, "a folder of mfvpr.export with this file", "export it again"):
+        description = json.loads((folder / DESCRIPTION).read_text(encoding="utf-8"))
         if description["format"] != FORMAT:
             raise InputError(f"expected the format {FORMAT!r}; export it again with this version")
         tensors = [description["inputs"], description["outputs"]]
         inputs, outputs = (tuple(Tensor(**each | {"shape": tuple(each["shape"])}) for each in side) for side in tensors)
-    exported = deserialize((folder / PROGRAM).read_bytes(), str(folder / PROGRAM))
+    with reading(folder / PROGRAM, mend=f"expected a program that JAX {jax.__version__} reads; export it again"):
+        exported = jax_export.deserialize(bytearray((folder / PROGRAM).read_bytes()))
     return ExportedProgram(folder, inputs, outputs, description, jax.jit(exported.call))
 
 
@@ -199,15 +192,6 @@ def export_program(program: Program) -> jax_export.Exported:
         got = f"{', '.join(sorted(calls))}; leave the operation out"
         raise InputError(f"scorer: expected a program without calls into libraries, got {got}")
     return exported
-
-
-def deserialize(content: bytes, where: str) -> jax_export.Exported:
-    """The serialized program; an InputError, which begins with `where`, if JAX cannot read it."""
-    try:
-        return jax_export.deserialize(bytearray(content))
-    except Exception as error:  # of flatbuffers, of MLIR, or of JAX's own checks
-        expected = f"a program that JAX {jax.__version__} reads"
-        raise InputError(f"{where}: expected {expected}, got {_one_line(error)}") from error
 
 
 def to_onnx(program: Program, inputs: dict[str, np.ndarray], outputs: dict[str, np.ndarray]) -> tuple[bytes, float]:

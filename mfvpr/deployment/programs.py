@@ -11,7 +11,7 @@ import numpy as np
 
 from mfvpr.core.batch import BIN_STEP
 from mfvpr.core.histogram import HistogramOfShifts
-from mfvpr.core.scorer import Scorer, fit_capacities, on_host, require_scores
+from mfvpr.core.scorer import Scorer, fit_capacities, require_scores
 from mfvpr.core.types import Array, Features, Matches
 from mfvpr.evaluation.system import System
 from mfvpr.matchers.host_matcher import PairSource
@@ -69,8 +69,7 @@ class Tensor(NamedTuple):
 class Program:
     """A function of arrays in the order of `inputs` that returns arrays in the order of `outputs`.
 
-    `form` is how it goes over the candidates: "vectorized", as this library does, or a "loop", which converters to
-    other formats understand.
+    `form` is how it goes over the candidates: "vectorized", or a "loop", which converters to other formats understand.
     """
 
     shapes: ExportShapes
@@ -109,10 +108,7 @@ def make_program(
         scorers = {"scores": method.scorers[main]}
         scorers |= {f"scores_{name}": scorer for name, scorer in method.scorers.items() if name != main}
         left_out = tuple(name for name in method.final_scores if name not in method.scorers)
-    for name, scorer in scorers.items():
-        if on_host(scorer):
-            kind, expected = type(scorer).__name__, "a scorer that JAX compiles, not on the host (score_pairs)"
-            raise InputError(f"{kind}: expected {expected}; leave it out")
+    for name in scorers:
         if not name.isidentifier():  # the name of a file
             got = name.removeprefix("scores_")
             raise InputError(f"scorers: expected names of letters, digits and _, got {got!r}; rename the scorer")
@@ -133,13 +129,14 @@ def make_program(
     def score_matches(arrays: dict[str, Array], form: Form) -> tuple[Array, ...]:
         of_query = {name: arrays[name] for name in _OF_QUERY}
         copies = {name: jnp.broadcast_to(each, (shapes.candidates, *each.shape)) for name, each in of_query.items()}
-        return _over(score, Matches(**(arrays | copies)), form)
+        matches = Matches(**(arrays | copies))
+        return _loop(score, matches) if form == "loop" else jax.vmap(score)(matches)
 
     def score_features(arrays: dict[str, Array], form: Form) -> tuple[Array, ...]:
         query, candidates = (Features(**{name: arrays[f"{name}{side}"] for name in of_features}) for side in "01")
         match: Callable[[Features], Matches] = partial(matcher, query)
         if form == "loop":
-            return _over(lambda candidate: score(match(candidate)), candidates, form)
+            return _loop(lambda candidate: score(match(candidate)), candidates)
         return jax.vmap(score)(jax.lax.map(match, candidates))  # one similarity matrix at a time
 
     inputs = tuple(Tensor.of(name, axes, shapes) for name, axes in table.items())
@@ -162,19 +159,16 @@ def _dimension(system: System, shapes: ExportShapes) -> int:
     return known
 
 
-def _over(function: Callable[[Any], tuple[Array, ...]], pairs: Any, form: Form) -> tuple[Array, ...]:
+def _loop(function: Callable[[Any], tuple[Array, ...]], pairs: Any) -> tuple[Array, ...]:
     """`function` of every entry of the first axis."""
-    if form == "vectorized":
-        return jax.vmap(function)(pairs)
     count = len(jax.tree.leaves(pairs)[0])
 
     def entry(index: Any) -> Any:
         return jax.tree.map(lambda leaf: jax.lax.dynamic_index_in_dim(leaf, index, keepdims=False), pairs)
 
     def step(index: Any, outputs: tuple[Array, ...]) -> tuple[Array, ...]:
-        values = function(entry(index))
-        update = jax.lax.dynamic_update_index_in_dim
-        return tuple(update(output, each, index, 0) for output, each in zip(outputs, values, strict=True))
+        parts = zip(outputs, function(entry(index)), strict=True)
+        return tuple(jax.lax.dynamic_update_index_in_dim(output, each, index, 0) for output, each in parts)
 
     shapes = jax.eval_shape(lambda: function(entry(0)))
     return jax.lax.fori_loop(0, count, step, tuple(jnp.zeros((count, *each.shape), each.dtype) for each in shapes))

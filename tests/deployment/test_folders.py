@@ -109,7 +109,7 @@ DAMAGE = {
     "no folder": (shutil.rmtree, r"export\.json: expected a folder of mfvpr\.export with this file, got nothing"),
     "another program": (
         lambda folder: (folder / "program.stablehlo").write_bytes(b"no program"),
-        r"program\.stablehlo: expected a program that JAX .* reads, got",
+        r"program\.stablehlo: cannot be read .*expected a program that JAX .* reads",
     ),
     "another version": (
         lambda folder: (folder / "export.json").write_text('{"format": "mfvpr exported program 2"}'),
