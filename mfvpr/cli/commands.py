@@ -24,11 +24,11 @@ from mfvpr.datasets.ground_truth import middle, threshold_words
 from mfvpr.datasets.published import PUBLISHED, published_differences
 from mfvpr.io import read_stamps, stamps_in_names
 from mfvpr.io.containers import reading
-from mfvpr.report import Table, prediction_files
+from mfvpr.report import Table, run_files
 from mfvpr.report.evaluations import sequence_folder
 from mfvpr.report.figures import contact_sheet
 from mfvpr.report.pages import write_comparison, write_report
-from mfvpr.report.prediction_files import LocalizedImage
+from mfvpr.report.run_files import LocalizedImage
 from mfvpr.report.runs import file_names
 from mfvpr.storage import FeatureCache
 from mfvpr.utils import InputError
@@ -261,7 +261,7 @@ def convert(
         raise InputError(f"{names[0]}: expected none for --layout {layout} of {source}; remove it")
     if not is_run:
         names = image_folder(database).names if database else ()
-        _write_localized(out, layout, prediction_files.read_lines(source), poses, names, times)
+        _write_localized(out, layout, run_files.read_lines(source), poses, names, times)
         return
     dataset, thresholds = _dataset_of_run(source)
     if times and len(dataset.sequences) > 1:
@@ -270,14 +270,14 @@ def convert(
     for place, sequence in enumerate(dataset.sequences):
         target = out / file_names(names)[sequence.name] if len(names) > 1 else out
         queries = sequence_folder(source, names, place)
-        images = prediction_files.read_run_images(queries, sequence.images.names)
+        images = run_files.read_run_images(queries, sequence.images.names)
         if layout not in _CANDIDATES:
             _write_localized(target, layout, images, poses, dataset.database.names, times)
             continue
-        shortlist = prediction_files.shortlist_of(images, dataset.database.names)
+        shortlist = run_files.shortlist_of(images, dataset.database.names)
         positives = sequence.truth.positives(middle(thresholds)) if sequence.truth and thresholds else None
         sides = sequence.images, dataset.database
-        prediction_files.write_candidates(target, shortlist, *sides, layout, positives, prefixes=prefixes)
+        run_files.write_candidates(target, shortlist, *sides, layout, positives, prefixes=prefixes)
         print(printable(f"{target}: candidates of {int(shortlist.mask.any(axis=1).sum())} queries"))
 
 
@@ -303,8 +303,8 @@ def _write_localized(
     names = [image.name for image in images]
     stamps = [] if layout == "kitti" else read_stamps(times, len(names)) if times else stamps_in_names(names)
     if layout == "shifts":
-        prediction_files.write_shift_table(path, images, stamps)
+        run_files.write_shift_table(path, images, stamps)
     elif poses is not None:
-        prediction_files.write_poses(path, images, poses, database, None if layout == "kitti" else stamps)
+        run_files.write_poses(path, images, poses, database, None if layout == "kitti" else stamps)
     num_places = sum(image.place is not None for image in images)
     print(printable(f"{path}: {num_places} images with a place, {len(images) - num_places} without"))

@@ -85,7 +85,7 @@ def histogram_figure(
     candidates: Sequence[Candidate],
     *,
     title: str,
-    original: Shaped[np.ndarray, "_ _ 3"] | None = None,
+    original: Shaped[np.ndarray, "_ _ 3"],
     about: Mapping[str, str] | None = None,
 ) -> None:
     """Write the figure of one query, with candidates one below the other, their histograms in the same colors.
@@ -93,8 +93,7 @@ def histogram_figure(
     The query's image has the size that the points refer to. Images are drawn in the shape of the `original`, which has
     square pixels. `about` is text by keyword in the file, for programs.
     """
-    (height, width), shown = (query_image if original is None else original).shape[:2], query_image.shape
-    count = len(candidates)
+    (height, width, _), shown, count = original.shape, query_image.shape, len(candidates)
     figure, axes = panels(2 * count, 6, 4.8 + 0.2 / count, columns=2, width_ratios=(2, 1.15))
     # A file's name may hold a $.
     figure.suptitle(clip_middle(printable(title), _TITLE_LENGTH), fontsize=11, parse_math=False)

@@ -266,8 +266,6 @@ def _write_search_page(folder: Path, results: Mapping[str, Any], path: Path) -> 
     write_page(path, title=title, words=words, facts={}, parts=parts)
 
 
-# --- recall of runs with ground truth ----------------------------------------------------------------------------
-
 Curves = Mapping[str, tuple[Run, str]]  # a run and one of its systems, by the name of their curve
 Chart = dict[str, Any]  # for script.js: points (x, y in %) by the name of their curve, or bars by that of their group
 

@@ -14,8 +14,7 @@ from mfvpr.evaluation.system import System
 from mfvpr.report.evaluations import EvaluationReport, recall_table
 from mfvpr.report.pages import write_comparison
 from mfvpr.report.pages import write_report as write_page
-from mfvpr.report.prediction_files import CandidateLayout, write_candidates
-from mfvpr.report.run_files import save_run
+from mfvpr.report.run_files import CandidateLayout, save_run, write_candidates
 from mfvpr.report.runs import Table, claim_run_folder, data_frame, file_names, write_table
 from mfvpr.storage.feature_cache import FeatureCache
 from mfvpr.utils.errors import InputError
@@ -57,16 +56,13 @@ def evaluate(
         cache: where all systems keep features, and with a folder also matches; None = features in memory.
         runtime: devices, memory, progress and messages; None = those of the cache.
 
-    Raises:
-        InputError: images or features that cannot be used, or an invalid result of an extractor, retrieval or scorer.
+    An `InputError` for images or features that cannot be used, or for an invalid result of a part of a system.
     """
     cache = FeatureCache() if cache is None else cache
     if not isinstance(cache, FeatureCache):
         raise InputError(f"cache: expected mfvpr.storage.FeatureCache(folder), got {type(cache).__name__}")
     datasets = data if isinstance(data, Mapping) else {data.name: data}
     systems = system if isinstance(system, Mapping) else {system.headline: system}
-    if not datasets or not systems:
-        raise InputError("evaluate: expected at least one data set and one system, got none")
     pairs = [(dataset_name, system_name) for dataset_name in datasets for system_name in systems]
     ranked = [rank_dataset(datasets[a], systems[b], cache=cache, runtime=runtime) for a, b in pairs]
     return Result(dict(zip(pairs, ranked, strict=True)), cache)

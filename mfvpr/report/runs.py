@@ -103,10 +103,9 @@ def read_csv(path: Path) -> list[dict[str, str]]:
 
 
 def write_csv(path: Path, header: Sequence[str], lines: Iterable[Iterable[Any]]) -> None:
-    """Write names as the very bytes that the file system has, so that they can be looked up again.
+    """Write names as the very bytes that the file system has; floating-point numbers with 7 digits, NaN as nothing.
 
-    Floating-point numbers get 7 digits, NaN an empty cell. A spreadsheet may take a name that begins with `=`, `+`, `-`
-    or `@` for a formula: import such columns as text.
+    A spreadsheet may take a name that begins with `=`, `+`, `-` or `@` for a formula: import such columns as text.
     """
 
     def text(cell: Any) -> Any:
@@ -145,16 +144,12 @@ def format_estimate(estimate: tuple[float, tuple[float, float]]) -> str:
     return f"{100 * estimate[0]:.1f} {format_interval(estimate[1])}"
 
 
-# --- run folders --------------------------------------------------------------------------------------------------
-
-
 @contextmanager
 def claim_run_folder(folder: Path, *, numbered: bool = False, own: bool = False) -> Iterator[Path]:
     """Make and lock a new or empty folder, until the block or the process ends; it is removed if it is still empty.
 
-    If `numbered`, `folder-2`, `folder-3`, ... stand in for a folder that exists. If only runs write into the folder
-    (`own`), files of a killed run are removed. An InputError if the folder cannot be written to, is not empty, or
-    another run uses it.
+    If `numbered`, `folder-2`, `folder-3`, ... stand in for one that exists. If only runs write into it (`own`), files
+    of a killed run are removed. An InputError if it cannot be written to, is not empty, or if another run uses it.
     """
     first, above = folder, [parent for parent in folder.absolute().parents if not parent.exists()]
     if folder.is_symlink() or folder.is_file():

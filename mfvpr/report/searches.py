@@ -36,8 +36,6 @@ _PALE, _MARK = "#2fa8ff", "#e8482c"
 _TOP = 10  # settings of the summary
 _MAX_HEAT_MAPS = 6
 
-# --- sweeps ------------------------------------------------------------------------------------------------------
-
 
 @dataclass(frozen=True, repr=False)
 class Sweep:
@@ -269,10 +267,7 @@ def comparison_json(comparison: "Comparison") -> dict[str, Any]:
 
 
 def comparison_table(comparison: "Comparison") -> Table:
-    """Recall at 1 of every row, its interval at the threshold that decides, and how it differs from the first row.
-
-    p is McNemar's, which takes queries for independent, and that of `path_test`.
-    """
+    """Recall at 1 of every row, its interval at the threshold that decides, and how it differs from the first row."""
     protocol, rows = comparison.protocol, comparison_json(comparison)["rows"]
     threshold = protocol.thresholds[protocol.main]
     main, words, lines = f"{threshold:g}", threshold_words(protocol.unit, threshold), []

@@ -14,9 +14,9 @@ def pixels(path):
     return np.asarray(Image.open(path).convert("L"))
 
 
-def draw(path, name, **options):
+def draw(path, name, original=QUERY):
     prediction = figures.Candidate(QUERY, f"incorrect: {name}, rank 1")
-    figures.histogram_figure(path, QUERY, [prediction], title=f"histogram: {name} -> {name}", **options)
+    figures.histogram_figure(path, QUERY, [prediction], title=f"histogram: {name} -> {name}", original=original)
     return pixels(path)
 
 

@@ -5,15 +5,15 @@ import json
 
 import pytest
 
-from mfvpr.report.prediction_files import (
+from mfvpr.report.run_files import (
     SHIFT_COLUMNS,
+    SHIFTS,
     read_lines,
     read_run_images,
     shortlist_of,
     write_poses,
     write_shift_table,
 )
-from mfvpr.report.run_files import SHIFTS
 from tests.io.checks import one_line_error
 
 DATABASE = ["0.png", "1.png", "2.png"]
