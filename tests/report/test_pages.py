@@ -30,7 +30,7 @@ class Parsed(HTMLParser):
 
     def __init__(self, path):
         super().__init__()
-        self.elements, self.open, self.text, self.rows, self.scripts = [], [], [], [], []
+        self.elements, self.open, self.text, self.rows, self.scripts = [], [], "", [], []
         self.feed(path.read_text("utf-8"))
 
     def handle_starttag(self, tag, attributes):
@@ -50,7 +50,7 @@ class Parsed(HTMLParser):
         if self.open[-1:] == ["script"]:
             self.scripts[-1] += data
         elif self.open[-1:] != ["style"]:
-            self.text.append(data)
+            self.text += data
             if {"td", "th"} & {*self.open}:
                 self.rows[-1][-1] += data
 
@@ -85,9 +85,8 @@ def several(tmp_path_factory):
 
 def test_names_are_nothing_but_text(page, several):
     for parsed in (page, several):
-        text = "".join(parsed.text).replace("\r", "\n")
         for name in (*HOSTILE, SYSTEMS[2], TWO[0]):
-            assert text_on_page(name) in text
+            assert text_on_page(name) in parsed.text.replace("\r", "\n")
         assert len(parsed.scripts) == 3
         attributes = {name for _, names in parsed.elements for name in names}
         assert not {name for name in attributes if name.startswith("on")}
@@ -113,9 +112,8 @@ def test_a_page_replaces_only_a_page(run, tmp_path):
     first = write_report(run, tmp_path / "page.html").read_bytes()
     assert write_report(run, tmp_path / "page.html").read_bytes() == first
     (tmp_path / "query.jpg").write_bytes(b"precious")
-    for write in (lambda path: write_report(run, path), lambda path: write_comparison([run], path)):
-        with pytest.raises(InputError, match=r"query\.jpg: expected a new file"):
-            write(tmp_path / "query.jpg")
+    with pytest.raises(InputError, match=r"query\.jpg: expected a new file"):
+        write_comparison([run], tmp_path / "query.jpg")
     assert (tmp_path / "query.jpg").read_bytes() == b"precious"
 
 
@@ -171,10 +169,10 @@ def test_without_ground_truth_there_are_answers_alone(tmp_path, monkeypatch):
     page = Parsed(write_report(write_run(tmp_path / "run", truth=False)))
     assert page.charts == {}
     assert [row[4] for row in page.rows if len(row) == 6 and row[0] in SYSTEMS] == ["best"] * 7
-    assert "It has the first 7" in "".join(page.text)
+    assert "It has the first 7" in page.text
 
 
-def test_runs_are_compared_query_by_query(tmp_path):
+def test_runs_of_the_same_queries_are_compared_query_by_query(tmp_path):
     other = RANKS | {HEADLINE: [2, 0, 1, 1, 1, 1, 1, 0, 0, 0]}
     runs = [write_run(tmp_path / "a"), write_run(tmp_path / "b", ranks=other)]
     write_comparison(runs, tmp_path / "page.html")
@@ -187,16 +185,13 @@ def test_runs_are_compared_query_by_query(tmp_path):
     assert [recall for _, recall, _ in bars] == [80.0, 50.0]
     recalls = [row[:2] for row in page.rows if row[0] in ("a", "b") and row[1] in SYSTEMS]
     assert recalls == [[run, system] for run in "ab" for system in SYSTEMS]
-
-
-def test_runs_of_other_queries_are_not(tmp_path):
     changes = {
         "other images": {"data_fingerprint": {"database": "1"}},
         "other queries": {"sequences": TWO},
         "another ground truth": {"ground_truth": {"kind": "order", "unit": "m", "thresholds": [25]}},
     }
-    runs = [write_run(tmp_path / "a"), *(write_run(tmp_path / name, **values) for name, values in changes.items())]
-    write_comparison(runs, tmp_path / "page.html")
+    others = [write_run(tmp_path / name, **values) for name, values in changes.items()]
+    write_comparison([runs[0], *others], tmp_path / "page.html")
     pairs = [row for row in Parsed(tmp_path / "page.html").rows if row[0] == f"a: {HEADLINE}"]
     assert pairs == [[f"a: {HEADLINE}", f"{reason}: {HEADLINE}", reason] for reason in changes]
 
@@ -219,7 +214,6 @@ def test_the_program_says_where_the_page_is_or_what_is_wrong(run, tmp_path, monk
     ("name", "text", "words"),
     [
         ("results.json", '{"settings": []}', "not enough values"),
-        ("run.json", "{", "Expecting property name"),
         ("gains.csv", "query,retrieval,retrieval rank\na,1,1\n", "place"),
         ("predictions/histogram.csv", "query,rank\na,1,1\n", "histogram.csv: expected lines of 2"),
     ],
