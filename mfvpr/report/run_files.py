@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Bool
 
 from mfvpr.core.types import Shortlist
-from mfvpr.datasets.contents import Contents, fingerprints, readings
+from mfvpr.datasets.contents import Contents, fingerprints
 from mfvpr.datasets.datasets import ImageFolder
 from mfvpr.datasets.positives import Positives
 from mfvpr.datasets.published import published_differences
@@ -145,7 +145,6 @@ def write_run_folder(folder: Path, report: EvaluationReport, description: RunDes
         "incomplete": list(published_differences(dataset)),
         "description": heading(report, description),
         "ground_truth": ground_truth(report, description),
-        "reading": readings(description.contents),
         "seconds": report.ranked.seconds,
     }
     lines, parameters = [], _parameters(report, description.settings)
