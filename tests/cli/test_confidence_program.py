@@ -107,6 +107,8 @@ def test_below_the_threshold_the_answer_is_no_place(evaluate, confidence):
     assert [[line["rank"], *(line[name] for name in columns)] for line in none] == [
         ["1", *(line[name] for name in columns)] for line in top if line["prediction"] == "no place"
     ]
+    shifted = [(line["query"], line["prediction"]) for line in csv_rows(out / "shifts.csv")]
+    assert shifted == [(line["query"], line["prediction"]) for line in top if line["prediction"] != "no place"]
     refusing = {line["query"] for line in none}
     rest = [line for line in csv_rows(out / "predictions" / "histogram.csv") if line["query"] not in refusing]
     assert [line for line in predictions if line not in none] == rest
