@@ -11,7 +11,7 @@ import numpy as np
 
 from mfvpr.core.batch import BIN_STEP
 from mfvpr.core.histogram import HistogramOfShifts
-from mfvpr.core.scorer import Scorer, fit_capacities, require_scores
+from mfvpr.core.scorer import Scorer, fit_capacities, on_host, require_scores
 from mfvpr.core.types import Array, Features, Matches
 from mfvpr.evaluation.system import System
 from mfvpr.matchers.host_matcher import PairSource
@@ -108,7 +108,10 @@ def make_program(
         scorers = {"scores": method.scorers[main]}
         scorers |= {f"scores_{name}": scorer for name, scorer in method.scorers.items() if name != main}
         left_out = tuple(name for name in method.final_scores if name not in method.scorers)
-    for name in scorers:
+    for name, scorer in scorers.items():
+        if on_host(scorer):
+            kind, expected = type(scorer).__name__, "a scorer that JAX compiles, not on the host (score_pairs)"
+            raise InputError(f"{kind}: expected {expected}; leave it out")
         if not name.isidentifier():  # the name of a file
             got = name.removeprefix("scores_")
             raise InputError(f"scorers: expected names of letters, digits and _, got {got!r}; rename the scorer")

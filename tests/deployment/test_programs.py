@@ -143,7 +143,7 @@ def branch_in_python(matches):
         (call_lapack, r"cusolver_\w+, lapack_ssyevd_ffi, lapack_sgesdd_ffi|lapack_sgesdd_ffi, lapack_ssyevd_ffi"),
         (branch_in_python, "code that JAX compiles for cpu and cuda, .* got TracerBoolConversionError.*use jax.numpy"),
         (lambda matches: matches.distance, r"expected a number for each of 1 pairs"),
-        (mfvpr.OpenCvHomography(), "homography_opencv: .*OpenCV runs outside of JAX"),
+        (mfvpr.OpenCvHomography(), r"OpenCvHomography: expected a scorer that JAX compiles, .*score_pairs"),
     ],
 )
 def test_scorers_that_cannot_be_exported_are_refused_by_the_operation(scorer, message):
