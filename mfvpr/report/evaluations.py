@@ -191,7 +191,6 @@ class EvaluationReport:
 
     @property
     def _truths(self) -> list[Truth]:
-        """Ground truth of each sequence, if there is any."""
         return [sequence.truth for sequence in self.sequences if sequence.truth is not None]
 
     def path_halves(self) -> tuple[Half, Half]:

@@ -1,5 +1,6 @@
 """Evaluation in one call, and its result: tables, predictions, run folders and a page."""
 
+import itertools
 import math
 import tempfile
 from collections.abc import Mapping, Sequence
@@ -63,9 +64,11 @@ def evaluate(
         raise InputError(f"cache: expected mfvpr.storage.FeatureCache(folder), got {type(cache).__name__}")
     datasets = data if isinstance(data, Mapping) else {data.name: data}
     systems = system if isinstance(system, Mapping) else {system.headline: system}
-    pairs = [(dataset_name, system_name) for dataset_name in datasets for system_name in systems]
-    ranked = [rank_dataset(datasets[a], systems[b], cache=cache, runtime=runtime) for a, b in pairs]
-    return Result(dict(zip(pairs, ranked, strict=True)), cache)
+    if not datasets or not systems:
+        raise InputError("evaluate: expected at least one data set and one system, got none")
+    pairs = itertools.product(datasets, systems)
+    parts = {(a, b): rank_dataset(datasets[a], systems[b], cache=cache, runtime=runtime) for a, b in pairs}
+    return Result(parts, cache)
 
 
 @dataclass(frozen=True, repr=False)
