@@ -12,13 +12,13 @@ from html.parser import HTMLParser
 import numpy as np
 import pytest
 
-from mfvpr.evaluation import mcnemar
+from mfvpr.evaluation import mcnemar, precision_recall
 from mfvpr.evaluation.statistics import path_test, recall_interval
 from mfvpr.report import pages
 from mfvpr.report.pages import write_comparison, write_report
 from mfvpr.utils import InputError
 from tests.programs import typed
-from tests.run_folders import HEADLINE, HOSTILE, RANKS, SYSTEMS, TOLERANCES, write_run
+from tests.run_folders import HEADLINE, HOSTILE, RANKS, SYSTEMS, TOLERANCES, ranking, write_run
 
 pytestmark = pytest.mark.thorough
 
@@ -119,22 +119,23 @@ def test_a_page_replaces_only_a_page(run, tmp_path):
 
 def test_recall_and_its_intervals_are_those_of_the_files(page):
     table = page.rows[: len(SYSTEMS) + 1]
-    assert table[0] == ["system", "R@1 ±2", "R@1 ±2, 95 %"]
+    assert table[0] == ["system", "R@1 ±0", "R@1 ±2", "R@1 ±5", "R@2 ±2", "R@1 ±2, 95 %"]
     for row, name in zip(table[1:], SYSTEMS, strict=True):
         hits = np.array(RANKS[name]) == 1
         low, high = recall_interval(hits)
-        assert row == [name, f"{100 * hits.mean():.1f}", f"[{100 * low:.1f}, {100 * high:.1f}]"]
+        assert [row[0], row[2], row[-1]] == [name, f"{100 * hits.mean():.1f}", f"[{100 * low:.1f}, {100 * high:.1f}]"]
     for (_, points), ranks in zip(page.charts["depths"]["data"], RANKS.values(), strict=True):
         assert points == [[k, 10 * sum(0 < rank <= k for rank in ranks)] for k in (1, 2, 3)]
     [[_, bars]] = page.charts["intervals"]["data"]
     assert [(name, recall) for name, recall, _ in bars] == [*zip(SYSTEMS, (30.0, 80.0, 60.0), strict=True)]
     assert bars[0][2] == [100 * end for end in recall_interval(np.array(RANKS["retrieval"]) == 1)]
-    for _, points in page.charts["tolerances"]["data"]:
-        largest = points[2][1]
-        assert points == [[at, pytest.approx(largest * part / 3)] for part, at in enumerate(TOLERANCES, start=1)]
-    [[name, points]] = page.charts["precision-score"]["data"]
-    assert name == f"{HEADLINE}: AP {100 * (0.25 + 0.25 + 0.25 * 0.75):.1f}"
-    assert points == [[25.0, 100.0], [50.0, 100.0], [75.0, 75.0]]
+    for (_, points), ranks in zip(page.charts["tolerances"]["data"], RANKS.values(), strict=True):
+        distance = np.abs(ranking(ranks).rows[:, 0] - np.arange(10))
+        assert points == [[at, pytest.approx(100 * np.mean(distance <= at))] for at in TOLERANCES]
+    [name, points] = page.charts["precision-score"]["data"][1]
+    curve = precision_recall(ranking(RANKS[HEADLINE]).scores[:, 0], np.array(RANKS[HEADLINE]) == 1)
+    assert name == f"{HEADLINE}: AP {100 * curve.average_precision:.1f}"
+    np.testing.assert_allclose(points, 100 * np.stack([curve.recall, curve.precision], axis=1), atol=1e-3)
 
 
 def test_sequences_have_bars_and_rows_of_their_own(several):
@@ -157,7 +158,7 @@ def test_answers_are_pictures_and_rows(page, several, run):
         assert base64.b64decode(image["src"].removeprefix("data:image/jpeg;base64,"))[:3] == b"\xff\xd8\xff"
     rows = [row for row in page.rows if len(row) == 6 and row[0] in SYSTEMS]
     assert [row[0] for row in rows] == [HEADLINE] * 10 + ["retrieval"] * 10 + [SYSTEMS[2]] * 10
-    expected = [HEADLINE, text_on_page(HOSTILE[3]), text_on_page(HOSTILE[-4]), "13", "incorrect", "2"]
+    expected = [HEADLINE, text_on_page(HOSTILE[3]), text_on_page(HOSTILE[-1]), "13", "incorrect", "2"]
     assert [cell.replace("\r", "\n") for cell in rows[3]] == expected
     assert [choice["id"] for choice in page.of("select")] == ["filter-system", "filter-outcome"]
     assert [choice["id"] for choice in several.of("select")] == ["filter-system", "filter-sequence", "filter-outcome"]
