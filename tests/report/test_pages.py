@@ -156,13 +156,13 @@ def test_answers_are_pictures_and_rows(page, several, run):
     for image in images:
         assert (image["width"], image["height"]) == ("1000", "231")
         assert base64.b64decode(image["src"].removeprefix("data:image/jpeg;base64,"))[:3] == b"\xff\xd8\xff"
-    rows = [row for row in page.rows if len(row) == 6 and row[0] in SYSTEMS]
+    rows = [row for row in page.rows if len(row) == 6 and row[4] in ("correct", "incorrect")]
     assert [row[0] for row in rows] == [HEADLINE] * 10 + ["retrieval"] * 10 + [SYSTEMS[2]] * 10
     expected = [HEADLINE, text_on_page(HOSTILE[3]), text_on_page(HOSTILE[-1]), "13", "incorrect", "2"]
     assert [cell.replace("\r", "\n") for cell in rows[3]] == expected
     assert [choice["id"] for choice in page.of("select")] == ["filter-system", "filter-outcome"]
     assert [choice["id"] for choice in several.of("select")] == ["filter-system", "filter-sequence", "filter-outcome"]
-    assert len([row for row in several.rows if len(row) == 7 and row[1] in TWO]) == 60
+    assert len([row for row in several.rows if len(row) == 7 and row[5] in ("correct", "incorrect")]) == 60
 
 
 def test_without_ground_truth_there_are_answers_alone(tmp_path, monkeypatch):
@@ -186,9 +186,10 @@ def test_runs_of_the_same_queries_are_compared_query_by_query(tmp_path):
     assert [recall for _, recall, _ in bars] == [80.0, 50.0]
     recalls = [row[:2] for row in page.rows if row[0] in ("a", "b") and row[1] in SYSTEMS]
     assert recalls == [[run, system] for run in "ab" for system in SYSTEMS]
+    truth = json.loads((runs[0] / "results.json").read_text("utf-8"))[0]["ground_truth"]
     changes = {
         "other images": {"data_fingerprint": {"database": "1"}},
-        "other queries": {"sequences": TWO},
+        "other queries": {"sequences": TWO, "ground_truth": truth},
         "another ground truth": {"ground_truth": {"kind": "order", "unit": "m", "thresholds": [25]}},
     }
     others = [write_run(tmp_path / name, **values) for name, values in changes.items()]
