@@ -32,8 +32,7 @@ class ExactSearch:
     Of equal descriptors in different blocks of 65,536 database rows, any may come first: last bits depend on the block.
     """
 
-    def fit(self, database: Database) -> "ExactSearch":
-        """Return itself: there is nothing to learn."""
+    def fit(self, database: Database) -> "ExactSearch":  # there is nothing to learn
         return self
 
     def shortlist(
@@ -91,7 +90,6 @@ class WhitenedSearch:
     def shortlist(
         self, queries: Queries, database: Database, num_candidates: int, *, excluded: Positives | None = None
     ) -> Shortlist:
-        """As `ExactSearch.shortlist`."""
         learned = self.whitening or self.fit(database).whitening
         assert learned is not None
         whiten = partial(_project, mean=learned.mean, components=learned.components)
@@ -141,16 +139,15 @@ def retrieve(
         shortlist = mfvpr.retrieve(query_descriptors, database_descriptors, num_candidates=50)
 
     Args:
-        query_descriptors: unit length.
-        database_descriptors: unit length. For several calls, put them on the device once (`jax.device_put`): with
-            NumPy's arrays every call copies them.
+        query_descriptors, database_descriptors: unit length. For several calls, put the database on the device once
+            (`jax.device_put`): NumPy's arrays are copied at every call.
         num_candidates: if there are fewer database images, the shortlist ends in -1.
         mask: False for database images that must not appear (for that query); another shape raises an `InputError`.
 
     Returns:
         Shortlist by descending cosine similarity; the first row wins a tie. A database image with a descriptor
-        that is not finite never appears; a query with a descriptor that is not finite has an empty shortlist. On a CPU
-        the scores of a query do not depend on the other queries, in any bit.
+        that is not finite never appears; a query with one has an empty shortlist. On a CPU the scores of a query do
+        not depend on the other queries, in any bit.
     """
     shapes = [(len(database_descriptors),), (len(query_descriptors), len(database_descriptors))]
     if mask is not None and mask.shape not in shapes:
