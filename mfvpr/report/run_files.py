@@ -197,7 +197,7 @@ def _cells(correct: np.ndarray | None, number: int) -> np.ndarray:
 
 def _write_queries(folder: Path, report: EvaluationReport, name: str, columns: Mapping[str, Any]) -> None:
     """Write a table for each sequence, from columns of all queries."""
-    columns = {"query": [name for _, name in report.queries]} | columns
+    columns = {"query": [name for _, name in report.queries], **columns}
     for place, part in enumerate(report.parts):
         lines = zip(*(column[part] for column in columns.values()), strict=True)
         write_csv(report.folder(folder, place) / name, [*columns], lines)

@@ -120,7 +120,8 @@ def write_csv(path: Path, header: Sequence[str], lines: Iterable[Iterable[Any]])
 def _csv(rows: Iterable[Iterable[Any]]) -> str:
     """Lines that end in \\n, where every cell with an end of a line is quoted."""
     lines = list[str]()
-    csv.writer(SimpleNamespace(write=lines.append)).writerows(rows)  # which quotes both characters of its line ends
+    file: Any = SimpleNamespace(write=lines.append)
+    csv.writer(file).writerows(rows)  # which quotes both characters of its line ends
     return "".join(line.removesuffix("\r\n") + "\n" for line in lines)
 
 
