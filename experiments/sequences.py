@@ -125,9 +125,9 @@ def lines(places: Mapping[str, Sequence[Place]]) -> Iterator[list[str]]:
 
 def run(drives: list[str], features: str) -> None:
     """Print a table of all data sets."""
-    system, cache = load_system("mfvpr", features=features), FeatureCache()
+    datasets, cache, system = datasets_of(drives), FeatureCache(), load_system("mfvpr", features=features)
     places = defaultdict[str, list[Place]](list)
-    for name, dataset in datasets_of(drives).items():
+    for name, dataset in datasets.items():
         places[name.partition(".")[0]].append(Place(dataset, system, cache))
     methods = next(iter(places.values()))[0].hits(np.arange(1))
     print(Table([f"R@1 ±{NEAR}", "drive", *methods], [*lines(places)], 2).markdown())

@@ -84,8 +84,8 @@ def row(kind: str, rows: list[int], predictions: list[Prediction]) -> list[str]:
 
 def run(drives: list[str], features: str) -> None:
     """Print a table for each drive."""
-    system = load_system("mfvpr", features=features)
-    for name, dataset in datasets_of(drives).items():
+    datasets, system = datasets_of(drives), load_system("mfvpr", features=features)
+    for name, dataset in datasets.items():
         rng, numbers = np.random.default_rng(0), [*range(len(dataset.queries))]
         with tempfile.TemporaryDirectory() as root:
             known = Map.create(Path(root) / "map", dataset.database, system, cache=FeatureCache())

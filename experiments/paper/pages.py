@@ -2,13 +2,13 @@
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import Any
 from urllib.parse import quote
 
 from experiments.paper.systems import LeftOut
 from experiments.paper.tables import Evaluations
 from mfvpr.report import Table
-from mfvpr.report.pages import write_comparison
-from mfvpr.report.rendering import PAGE, Section, values_table, write_page
+from mfvpr.report.pages import PAGE, write_comparison, write_page
 from mfvpr.utils.fingerprints import versions
 
 
@@ -28,18 +28,18 @@ def write_pages(
         links += [(f"{dataset}: {run}", folder / PAGE) for run, folder in folders.items()]
     addresses = [(words, quote(path.relative_to(out).as_posix())) for words, path in links if path.is_file()]
 
-    about = {"Left out": Table(["what", "why"], left_out, text_columns=2)} if left_out else {}
-    about["Versions"] = values_table(versions())
+    about: dict[str, Any] = {"Left out": Table(["what", "why"], left_out, text_columns=2)} if left_out else {}
+    about["Versions"] = versions()
     costs = dict(tables[name] for name in ("sizes", "seconds") if name in tables)
     recalls = dict(table for name, table in tables.items() if name not in ("data_sets", "sizes", "seconds"))
     words = "In %. Where the paper prints a number, that and the difference stand beside ours."
     links_words = "Their own pages with their settings, and all of a data set side by side, with tests and intervals."
-    sections = [
-        Section("recall", "Recall", words, tables=recalls),
-        Section("pages", "Every evaluation", links_words, links=addresses),
-        Section("costs", "Seconds and sizes", tables=costs),
-        Section("data", "Data sets", tables=dict([tables["data_sets"]]) | about),
-    ]
+    parts = {
+        "Recall": {"words": words, "tables": recalls},
+        "Every evaluation": {"words": links_words, "links": addresses},
+        "Seconds and sizes": {"tables": costs},
+        "Data sets": {"tables": dict([tables["data_sets"]]) | about},
+    }
     words = f"{len(evaluations.datasets)} data sets, {len(evaluations.folders)} evaluations, "
     words += "after Pivonka and Preucil, IEEE T-IV 2024"
-    write_page(out / PAGE, title="The paper's evaluation", words=words, facts={}, sections=sections)
+    write_page(out / PAGE, title="The paper's evaluation", words=words, facts={}, parts=parts)
