@@ -96,7 +96,6 @@ class LearnedWeight:
 
 
 def _raw_inputs(matches: Matches, names: tuple[str, ...]) -> Float[Array, "*batch slots inputs"]:
-    """Inputs that are not standardized; 0 on padding."""
     columns = [masked(jnp.broadcast_to(INPUTS[name](matches), matches.mask.shape), matches.mask) for name in names]
     return jnp.stack(columns, axis=-1)
 

@@ -23,14 +23,13 @@ from mfvpr.core.matching import (
 )
 from mfvpr.core.nearest import CrossCheck, Product, Query, largest_of, lines_of, products, ready
 from mfvpr.core.types import Array, Features, Matches, short_repr, value
-from mfvpr.networks.lightglue_assignment import Packed, assignment
 from mfvpr.utils.errors import InputError, require_word
 from mfvpr.utils.fields import COUNT, check_fields, number, setting, word_of
 from mfvpr.utils.fingerprints import fingerprint, recipe_of
 from mfvpr.utils.numerics import as_array, as_float, compiled, is_concrete, masked, positive, safe_sqrt
 
 if TYPE_CHECKING:  # Flax takes half a second
-    from mfvpr.networks.lightglue import LightGlue
+    from mfvpr.networks.lightglue import LightGlue, Packed
 
 CHUNK_SIZE = "pairs matched at once; null = 1 on a CPU, elsewhere what a small part of its memory holds"
 
@@ -114,7 +113,7 @@ class LightGlueMatcher:
         chunk_size: pairs at a time, see `mfvpr.Matcher`; changes only memory, time and the last bits.
     """
 
-    weights: Packed
+    weights: "Packed"
     network: str = field(metadata={"static": True})
     filter_threshold: float = setting(
         0.1, number(0, 1), "matches are kept whose assignment, their confidence, is above it"
@@ -149,6 +148,8 @@ class LightGlueMatcher:
 
         Descriptors of another dimension raise an `InputError`.
         """
+        from mfvpr.networks.lightglue import assignment
+
         features0, features1 = (ready(at_least_one(features)) for features in (features0, features1))
         for features in (features0, features1):
             if (got := features.descriptors.shape[-1]) != self.dimension:

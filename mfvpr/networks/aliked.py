@@ -15,8 +15,22 @@ from flax import nnx
 from jaxtyping import Bool, Float, Int
 
 from mfvpr.core.types import Array
-from mfvpr.networks.layers import EPSILON, PRECISION, BatchNorm, Images, bias_of, conv, matmul, of_unit_length
-from mfvpr.networks.sampling import Neighbors, around, between, neighbors, sample, stretch
+from mfvpr.networks.layers import (
+    EPSILON,
+    PRECISION,
+    BatchNorm,
+    Images,
+    Neighbors,
+    around,
+    between,
+    bias_of,
+    conv,
+    matmul,
+    neighbors,
+    of_unit_length,
+    sample,
+    stretch,
+)
 
 STRIDE = 32  # px, of the coarsest map
 RADIUS = 2  # px, of the suppression, the refinement and the border without keypoints

@@ -18,8 +18,7 @@ from jaxtyping import Bool, Float, Int
 
 from mfvpr.core.types import Array
 from mfvpr.networks.backbones import Vgg16
-from mfvpr.networks.layers import Images, Pixels, Preprocessing, of_unit_length, preprocess
-from mfvpr.networks.sampling import sample, stretch
+from mfvpr.networks.layers import Images, Pixels, Preprocessing, of_unit_length, preprocess, sample, stretch
 
 STRIDE = 4  # px between positions of the map
 SCALES = (0.5, 1.0, 2.0)  # of the multi-scale detection, in this order

@@ -22,7 +22,6 @@ from mfvpr.networks.layers import (
     LayerNorm,
     Linear,
     Pixels,
-    PointwiseConv,
     bias_of,
     matmul,
     of_unit_length,
@@ -52,14 +51,14 @@ class NetVlad(nnx.Module):
     """
 
     def __init__(self, clusters: int, order: Order = "clusters", *, rngs: nnx.Rngs) -> None:
-        self.assignment = PointwiseConv(CHANNELS, clusters, rngs=rngs)
+        self.assignment = Linear(CHANNELS, clusters, use_bias=False, rngs=rngs)
         self.centers = nnx.Param(jnp.zeros((clusters, CHANNELS), jnp.float32))
         self.order = order
 
     def __call__(self, maps: Float[Array, "batch rows columns channels"]) -> Float[Array, "batch dimensions"]:
         """Descriptors of unit length."""
         x = of_unit_length(maps.reshape(len(maps), -1, CHANNELS))
-        share = self._shares(x)
+        share = nnx.softmax(self.assignment(x))
         sums = jnp.einsum("bpk,bpd->bkd", share, x, precision=PRECISION)
         return self._descriptors(sums - jnp.sum(share, axis=1)[..., None] * self.centers[...][None])
 
@@ -68,17 +67,13 @@ class NetVlad(nnx.Module):
     ) -> Float[Array, "batch (rows-{size}+1)*(columns-{size}+1) dimensions"]:
         """Descriptors of all squares of `size` positions, by rows."""
         x = of_unit_length(maps)
-        residuals = self._shares(x)[..., None] * (x[..., None, :] - self.centers[...][None, None, None])
+        residuals = nnx.softmax(self.assignment(x))[..., None] * (x[..., None, :] - self.centers[...][None, None, None])
         sums = residuals
         for axis in (1, 2):  # a product with ones and zeros; differences of cumulative sums round more
             inside = np.subtract.outer(np.arange(sums.shape[axis]), np.arange(sums.shape[axis] - size + 1))
             band = jnp.asarray((inside >= 0) & (inside < size), sums.dtype)
             sums = jnp.moveaxis(jnp.tensordot(band, sums, axes=(0, axis), precision=PRECISION), 0, axis)
         return self._descriptors(sums.reshape(len(maps), -1, *sums.shape[3:]))
-
-    def _shares(self, x: Float[Array, "*batch channels"]) -> Float[Array, "*batch clusters"]:
-        """Shares of the clusters for vectors of unit length."""
-        return nnx.softmax(matmul(x, self.assignment.kernel[0, 0]), axis=-1)
 
     def _descriptors(self, sums: Float[Array, "*batch clusters channels"]) -> Float[Array, "*batch dimensions"]:
         sums = of_unit_length(sums)

@@ -51,21 +51,6 @@ class BlockOutput(NamedTuple):
     attention: Float[Array, "batch rows columns"]  # of the class token, mean over the heads
 
 
-class Patches(nnx.Module):
-    """Linear map of each patch: `kernel` `[14, 14, 3, D]`, `bias` `[D]`."""
-
-    def __init__(self, width: int, *, rngs: nnx.Rngs) -> None:
-        initial = nnx.initializers.lecun_normal()
-        self.kernel = nnx.Param(initial(rngs.params(), (PATCH, PATCH, 3, width), jnp.float32))
-        self.bias = nnx.Param(jnp.zeros(width, jnp.float32))
-
-    def __call__(self, images: Images) -> Float[Array, "batch (height//14)*(width//14) dimensions"]:
-        batch, rows, columns = len(images), images.shape[1] // PATCH, images.shape[2] // PATCH
-        pixels = images.reshape(batch, rows, PATCH, columns, PATCH, 3).swapaxes(2, 3)
-        kernel = self.kernel[...].reshape(-1, self.kernel.shape[-1])
-        return matmul(pixels.reshape(batch, rows * columns, -1), kernel) + self.bias[...][None, None]
-
-
 class Attention(nnx.Module):
     """Multi-head self-attention of tokens."""
 
@@ -124,7 +109,8 @@ class VisionTransformer(nnx.Module):
     def __init__(
         self, width: int, depth: int, heads: int, *, registers: int = 0, block: type[Block] = Block, rngs: nnx.Rngs
     ) -> None:
-        self.patches = Patches(width, rngs=rngs)
+        patch = {"kernel_size": (PATCH, PATCH), "strides": PATCH, "padding": "VALID"}
+        self.patches = nnx.Conv(3, width, **patch, precision=PRECISION, rngs=rngs)
         self.first = nnx.Param(jnp.zeros(width, jnp.float32))  # the class token
         self.positions = nnx.Param(jnp.zeros((1 + _TRAINED**2, width), jnp.float32))
         if registers:
@@ -157,7 +143,8 @@ class VisionTransformer(nnx.Module):
         first = (self.first[...] + self.positions[...][0])[None]
         extra = jnp.concatenate([first, self.registers[...]]) if self.has_registers else first
         extra = jnp.broadcast_to(extra, (len(images), *extra.shape))
-        states = [jnp.concatenate([extra, self.patches(images) + positions[None]], axis=1)]
+        patches = self.patches(images).reshape(len(images), -1, self.width)
+        states = [jnp.concatenate([extra, patches + positions[None]], axis=1)]
         for block in self.blocks:
             states.append(block(states[-1]))
         return states

@@ -12,7 +12,7 @@ from mfvpr import InputError
 from mfvpr.features import AlikedFeatures
 from mfvpr.networks import Aliked
 from mfvpr.networks.aliked import DeformableConv, DescriptorHead, _inside, detect, field
-from mfvpr.networks.sampling import sample, stretch
+from mfvpr.networks.layers import sample, stretch
 from tests.builders import local
 from tests.golden.make_aliked import DRAWN, REAL, checkpoint, picture, projections, samples, texture
 from tests.needs import ALIKED, PHOTOGRAPHS, needs

@@ -7,8 +7,7 @@ import pytest
 from flax import nnx
 
 from mfvpr.networks import Vgg16
-from mfvpr.networks.layers import Conv3x3, preprocess, winograd
-from mfvpr.networks.sampling import sample, stretch
+from mfvpr.networks.layers import Conv3x3, preprocess, sample, stretch, winograd
 from tests.networks import aliked_oracle as oracle
 
 pytestmark = pytest.mark.thorough
