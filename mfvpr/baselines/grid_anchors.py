@@ -7,7 +7,7 @@ a patch of n x n cells around it. A cell of the patch agrees if index[anchor + o
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Float, Int
+from jaxtyping import Float
 
 from mfvpr.core.types import Array, Matches, value
 from mfvpr.core.weights import match_confidence
@@ -72,7 +72,7 @@ class GridAnchors:
         anchors, neighbors = (masked(index, matched, never).reshape(side, side) for never in (2**20, -(2**20)))
         neighbors = jnp.pad(neighbors, half, constant_values=_OUTSIDE[self.outside])
 
-        def count_row(row: Array, counts: Int[Array, "{side} {side}"]) -> Int[Array, "{side} {side}"]:
+        def count_row(row: Array, counts: Array) -> Array:
             """Add the cells of one row of each patch that agree with its anchor."""
             cells = jax.lax.dynamic_slice_in_dim(neighbors, row, side)
             for column in range(self.size):

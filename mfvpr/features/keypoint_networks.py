@@ -13,12 +13,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
-from jaxtyping import Float, Num
+from jaxtyping import Num
 
 from mfvpr.features.extractor import Description, Scale, local_features
 from mfvpr.features.network import NetworkExtractor, compile_network, in_batches
 from mfvpr.networks import aliked, d2net
-from mfvpr.networks.layers import Preprocessing
+from mfvpr.networks.layers import Detections, Preprocessing
 from mfvpr.utils.errors import InputError
 from mfvpr.utils.fields import FLAG, NOT_NEGATIVE, SHAPED_SIZE, SIZE, setting, whole, word_of
 from mfvpr.utils.numerics import device_bytes
@@ -28,11 +28,53 @@ _SHARE = 0.3  # keypoint slots of D2-Net per position of its map; photographs ta
 _SMALLEST_MAP = 2  # of D2-Net
 
 
-def _without_empty_slots(result: Any, count_of: Callable[[Any], Array]) -> Any:
-    """A batch's result without most of the slots that no image fills: an accelerator returns them slowly."""
-    if device_bytes(()) is None:  # a CPU, where nothing moves
-        return result
-    return _first_slots(result, 256 * math.ceil(np.max(count_of(result)) / 256))  # few sizes: each is a program
+@dataclass(frozen=True)
+class KeypointNetwork(NetworkExtractor):
+    """Base of the extractors of keypoints; the result of a network is a tuple of `Detections`, as of several scales."""
+
+    has_vector = False
+    max_keypoints: int | None = None
+
+    def run_network(self, images: Num[np.ndarray, "images height width 3"]) -> list[Any]:
+        usual = self.slots()
+        results = in_batches(self._program(usual), images, self.batch_size)
+        counts = [[(int(level.count), len(level.mask)) for level in result] for result in results]
+        crowded = [row for row, levels in enumerate(counts) if any(count > slots for count, slots in levels)]
+        more = self.slots(max((count for levels in counts for count, _ in levels), default=0))
+        if crowded and more > usual:
+            again = in_batches(self._program(more), images[crowded], self.batch_size)
+            for row, result in zip(crowded, again, strict=True):
+                results[row] = result
+        return results
+
+    @cached_property
+    def _program(self) -> Callable[[float], Callable[[Any], Any]]:
+        """The compiled network for a number of slots."""
+
+        @cache
+        def program(slots: float) -> Callable[[Any], Any]:
+            run = compile_network(self.model, partial(self.compute, slots=slots))  # pyright: ignore[reportCallIssue]
+            return run if device_bytes(()) is None else lambda images: self._without_empty_slots(run(images))
+
+        return program
+
+    def _without_empty_slots(self, result: Any) -> Any:
+        """A batch's result without most of the slots that no image fills: an accelerator returns them slowly."""
+        most = max(int(np.max(level.count)) for level in result)
+        return _first_slots(result, 256 * math.ceil(most / 256))  # few sizes: each is a program
+
+    def slots(self, count: int | None = None) -> float:
+        """Slots for what images usually have, or for images of up to `count` keypoints."""
+        raise NotImplementedError
+
+    def describe_result(self, result: tuple[Detections, ...]) -> Description:
+        keypoints, descriptors, scores = (
+            np.concatenate([getattr(level, name)[level.mask] for level in result])
+            for name in ("keypoints", "descriptors", "scores")
+        )
+        strongest = np.sort(np.argsort(-scores, kind="stable")[: self.max_keypoints])
+        features = local_features(keypoints[strongest], descriptors[strongest], self.image_size, scores[strongest])
+        return Description(local=(features,))
 
 
 @partial(jax.jit, static_argnums=1)
@@ -41,7 +83,7 @@ def _first_slots(result: Any, slots: int) -> Any:
 
 
 @dataclass(frozen=True)
-class AlikedFeatures(NetworkExtractor):
+class AlikedFeatures(KeypointNetwork):
     """ALIKED's keypoints and descriptors of 128 dimensions (64 of the smallest network), as the public code has them.
 
     Keypoints are in row order, or by falling score if an image has more than `max_keypoints`.
@@ -50,7 +92,6 @@ class AlikedFeatures(NetworkExtractor):
     default is that of Pivonka & Preucil (IEEE T-IV 2024).
     """
 
-    has_vector = False
     side_multiple = aliked.STRIDE  # px: other images are padded, which costs recall
     image_size: tuple[int, int] = setting((320, 320), SIZE, SHAPED_SIZE)
     threshold: float = setting(0.1, NOT_NEGATIVE, "of the detection score: the paper's; its authors' default is 0.2")
@@ -66,41 +107,17 @@ class AlikedFeatures(NetworkExtractor):
         pixels = math.prod(self.image_size)
         return pixels if self.max_keypoints is None else min(self.max_keypoints, pixels)
 
-    def run_network(self, images: Num[np.ndarray, "images height width 3"]) -> list[Any]:
-        usual = min(self._limit, math.ceil(math.prod(self.image_size) / _PIXELS_PER_SLOT))
-        results = in_batches(self._program(usual), images, self.batch_size)
-        counts = [int(detections.count) for detections, _ in results]
-        crowded = [row for row, count in enumerate(counts) if count > usual]
-        if crowded and usual < self._limit:
-            capacity = min(self._limit, 1 << (max(counts) - 1).bit_length())  # powers of two: few programs
-            again = in_batches(self._program(capacity), images[crowded], self.batch_size)
-            for row, result in zip(crowded, again, strict=True):
-                results[row] = result
-        return results
+    def slots(self, count: int | None = None) -> int:
+        usual = math.ceil(math.prod(self.image_size) / _PIXELS_PER_SLOT)
+        powers_of_two = usual if count is None else 1 << (count - 1).bit_length()  # few programs
+        return min(self._limit, powers_of_two)
 
-    @cached_property
-    def _program(self) -> Callable[[int], Callable[[Any], Any]]:
-        """The compiled network for a number of keypoint slots."""
-
-        def extract(model: aliked.Aliked, images: Array, *, capacity: int) -> Any:
-            return model.extract(images.astype(jnp.float32) / 255, self.threshold, capacity)
-
-        @cache
-        def program(capacity: int) -> Callable[[Any], Any]:
-            run = compile_network(self.model, partial(extract, capacity=capacity))
-            return lambda images: _without_empty_slots(run(images), lambda result: result[0].count)
-
-        return program
-
-    def describe_result(self, result: tuple[Any, Float[np.ndarray, "slots dimensions"]]) -> Description:
-        detections, descriptors = result
-        keypoints, scores, mask = map(np.asarray, (detections.keypoints, detections.scores, detections.mask))
-        features = local_features(keypoints[mask], descriptors[mask], self.image_size, scores[mask])
-        return Description(local=(features,))
+    def compute(self, model: aliked.Aliked, images: Array, *, slots: int) -> Any:
+        return (model.extract(images.astype(jnp.float32) / 255, self.threshold, slots),)
 
 
 @dataclass(frozen=True)
-class D2NetFeatures(NetworkExtractor):
+class D2NetFeatures(KeypointNetwork):
     """D2-Net's keypoints and descriptors of 512 dimensions, as the public code extracts them and in its order.
 
     Scores are activations, which are not comparable between images. `multiscale` detects at half, full and double size,
@@ -110,7 +127,6 @@ class D2NetFeatures(NetworkExtractor):
         InputError: images of this size are too small for the network.
     """
 
-    has_vector = False
     image_size: tuple[int, int] = setting((336, 336), SIZE, SHAPED_SIZE)
     preprocessing: Preprocessing = setting("caffe", word_of(Preprocessing))
     multiscale: bool = setting(False, FLAG)
@@ -138,30 +154,10 @@ class D2NetFeatures(NetworkExtractor):
     def _network_scales(self) -> tuple[float, ...]:
         return d2net.SCALES if self.multiscale else (1.0,)
 
-    def run_network(self, images: Num[np.ndarray, "images height width 3"]) -> list[Any]:
-        results = in_batches(self._program(_SHARE), images, self.batch_size)
-        crowded = [row for row, levels in enumerate(results) if any(level.count > len(level.mask) for level in levels)]
-        for row, levels in zip(crowded, in_batches(self._program(1.0), images[crowded], self.batch_size), strict=True):
-            results[row] = levels
-        return results
+    def slots(self, count: int | None = None) -> float:
+        """Share of the map's positions that have a slot."""
+        return _SHARE if count is None else 1.0
 
-    @cached_property
-    def _program(self) -> Callable[[float], Callable[..., Any]]:
-        """The compiled network for a share of positions that have a keypoint slot."""
-        function = partial(d2net.extract, preprocessing=self.preprocessing, scales=self._network_scales)
-
-        @cache
-        def program(share: float) -> Callable[[Any], Any]:
-            run = compile_network(self.model, partial(function, share=share))
-            return lambda images: tuple(_without_empty_slots(level, lambda level: level.count) for level in run(images))
-
-        return program
-
-    def describe_result(self, result: tuple[d2net.Detections, ...]) -> Description:
-        keypoints, descriptors, scores = (
-            np.concatenate([getattr(level, name)[level.mask] for level in result])
-            for name in ("keypoints", "descriptors", "scores")
-        )
-        strongest = np.sort(np.argsort(-scores, kind="stable")[: self.max_keypoints])
-        features = local_features(keypoints[strongest], descriptors[strongest], self.image_size, scores[strongest])
-        return Description(local=(features,))
+    def compute(self, model: d2net.D2Net, images: Array, *, slots: float) -> Any:
+        options = {"preprocessing": self.preprocessing, "scales": self._network_scales}
+        return d2net.extract(model, images, **options, share=slots)

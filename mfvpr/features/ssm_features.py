@@ -7,7 +7,6 @@ from functools import cached_property
 from typing import Any, ClassVar, Literal
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float, Num
 
@@ -16,19 +15,12 @@ from mfvpr.features.extractor import Description, Scale, local_features
 from mfvpr.features.network import NetworkExtractor, compile_network, only_size
 from mfvpr.features.whitening import Whitening, WindowFitting, Windows, kernels, learned_whitening
 from mfvpr.networks.backbones import STAGE1_STRIDE, STAGE2_STRIDE, SsmVgg
-from mfvpr.networks.layers import PRECISION, Preprocessing
+from mfvpr.networks.layers import PRECISION, Preprocessing, of_unit_length
 from mfvpr.utils.fields import SIZE, setting, whole, word_of
 
 _CHANNELS = 512
-_STRIDES = {1: STAGE1_STRIDE, 2: STAGE2_STRIDE}
-_FITTINGS = {1: WindowFitting(125), 2: WindowFitting(100, dtype="float64")}  # as published
+_OF_WINDOWS, _OF_CELLS = WindowFitting(125), WindowFitting(100, dtype="float64")  # as published
 _MIDDLE = (STAGE2_STRIDE - 1) / 2  # px from a position's first pixel to its middle
-
-
-def normalize_maps(maps: Float[Array, "*batch channels"]) -> Float[Array, "*batch channels"]:
-    """Scale maps to unit length at every position; zero stays zero."""
-    length = jnp.sqrt(jnp.sum(maps * maps, axis=-1, keepdims=True))
-    return maps / jnp.where(length > 0, length, 1.0)
 
 
 def whiten_windows(
@@ -39,11 +31,8 @@ def whiten_windows(
     stride: int,
 ) -> Float[Array, "images windows dimensions"]:
     """Descriptors of all windows of maps."""
-    axes = ("NHWC", "HWIO", "NHWC")
-    strides = (stride, stride)
-    descriptors = jax.lax.conv_general_dilated(
-        maps, kernel, strides, "VALID", dimension_numbers=axes, precision=PRECISION
-    )
+    layout = {"dimension_numbers": ("NHWC", "HWIO", "NHWC"), "precision": PRECISION}
+    descriptors = jax.lax.conv_general_dilated(maps, kernel, (stride, stride), "VALID", **layout)
     return descriptors.reshape(len(maps), -1, descriptors.shape[-1]) - offset[None, None]
 
 
@@ -57,7 +46,8 @@ class SsmMaps(NetworkExtractor):
     @property
     def shape(self) -> tuple[int, int, int]:
         """(rows, columns, channels) of a map."""
-        columns, rows = (-(-side // _STRIDES[self.stage]) for side in self.image_size)
+        stride = {1: STAGE1_STRIDE, 2: STAGE2_STRIDE}[self.stage]
+        columns, rows = (-(-side // stride) for side in self.image_size)
         return rows, columns, _CHANNELS
 
     @property
@@ -68,7 +58,7 @@ class SsmMaps(NetworkExtractor):
         self, model: SsmVgg, images: Num[Array, "images height width 3"]
     ) -> Float[Array, "images rows columns 512"]:
         """Maps of a batch; runs in a compiled program."""
-        return normalize_maps(model(model.preprocess(images, self.preprocessing), self.stage))
+        return of_unit_length(model(model.preprocess(images, self.preprocessing), self.stage))
 
 
 @dataclass(frozen=True)
@@ -83,12 +73,8 @@ class _WhitenedWindows(NetworkExtractor):
     preprocessing: Preprocessing = setting(
         "torch", word_of(Preprocessing), "torch, as published, or caffe, which the weights are for"
     )
-    whitening: WindowFitting | Whitening = _FITTINGS[1]
-
-    @property
-    def windows(self) -> Windows:
-        """The windows of a map."""
-        raise NotImplementedError
+    whitening: WindowFitting | Whitening = _OF_WINDOWS
+    windows: ClassVar[Any]  # the Windows of a map, a property
 
     @property
     def maps(self) -> SsmMaps:
@@ -100,7 +86,8 @@ class _WhitenedWindows(NetworkExtractor):
     def _program(self) -> Callable[..., Any]:
         """Images -> whitened windows `[V, D']`; the whitening is an argument, so that XLA does not fold it."""
         maps, windows = self.maps, self.windows
-        convolution = jax.device_put(kernels(learned_whitening(self), windows))
+        whitening = learned_whitening(self)  # pyright: ignore[reportArgumentType]
+        convolution = jax.device_put(kernels(whitening, windows))
 
         def describe(model: SsmVgg, images: Array, kernel: Array, offset: Array) -> Array:
             return whiten_windows(maps.compute(model, images), kernel, offset, stride=windows.stride)
@@ -118,7 +105,6 @@ class SsmWindows(_WhitenedWindows):
 
     stage = 1
     image_size: tuple[int, int] = only_size(224, 224)
-    whitening: WindowFitting | Whitening = _FITTINGS[1]
 
     @property
     def windows(self) -> Windows:
@@ -146,7 +132,7 @@ class SsmCells(_WhitenedWindows):
     image_size: tuple[int, int] = setting(
         (336, 336), SIZE, "width, height: 40 x 40 cells; [224, 224]: 26 x 26, [448, 448]: 54 x 54"
     )
-    whitening: WindowFitting | Whitening = _FITTINGS[2]
+    whitening: WindowFitting | Whitening = _OF_CELLS
     stride: int = setting(1, whole(1, 8), "positions of the map, 8 px each, from cell to cell")
 
     def __post_init__(self) -> None:

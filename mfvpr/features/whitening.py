@@ -111,7 +111,6 @@ class Windows:
 
     @property
     def count(self) -> int:
-        """Number of windows of a map."""
         return self.grid[0] * self.grid[1]
 
     @property

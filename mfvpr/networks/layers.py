@@ -171,6 +171,16 @@ class GeneralizedMean(nnx.Module):
         return largest[:, 0, 0] * means ** (1 / power)
 
 
+class Detections(NamedTuple):
+    """Keypoints of one image or map, padding last."""
+
+    keypoints: Float[Array, "slots 2"]  # (x, y) px
+    scores: Float[Array, " slots"]
+    mask: Bool[Array, " slots"]  # True on the first ones
+    count: Int[Array, ""]  # number of keypoints; if above the slots, those with the lowest scores are missing
+    descriptors: Float[Array, "slots dimensions"] | None = None  # of unit length
+
+
 class Neighbors(NamedTuple):
     """Pixels before and after each position on a line, and the position between them."""
 

@@ -12,7 +12,7 @@ from typing import NamedTuple, TypeVar
 import jax
 import jax.numpy as jnp
 from flax import nnx
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 
 from mfvpr.core.types import Array, Features
 from mfvpr.networks.layers import bias_of, matmul
@@ -49,9 +49,7 @@ class Block(NamedTuple):
     shift: Float[Array, " 2*width"]
     update: Affine  # hidden values -> change of the state
 
-    def within(
-        self, states: States, mask: Bool[Array, " keypoints"], rotation: Float[Array, "2 keypoints angles"]
-    ) -> States:
+    def within(self, states: States, mask: Array, rotation: Float[Array, "2 keypoints angles"]) -> States:
         """States after self-attention of the keypoints of one image, masked by `mask`.
 
         The rotation encodes positions: cosines and sines of angles that turn pairs of numbers of a head, half a head
@@ -89,16 +87,12 @@ class Block(NamedTuple):
         return states + self.update(jax.nn.gelu(hidden, approximate=False))
 
 
-def _heads(
-    values: Float[Array, "keypoints _"], parts: int, head: int
-) -> Float[Array, "{parts} heads keypoints {head}"]:
+def _heads(values: Array, parts: int, head: int) -> Float[Array, "{parts} heads keypoints {head}"]:
     """Split the numbers of each keypoint into parts and heads."""
     return jnp.moveaxis(values.reshape(len(values), parts, -1, head), 0, 2)
 
 
-def _weights(
-    logits: Float[Array, "heads rows columns"], mask: Bool[Array, " keypoints"], axis: int
-) -> tuple[Float[Array, "heads rows columns"], Float[Array, "heads _ _"]]:
+def _weights(logits: Float[Array, "heads rows columns"], mask: Array, axis: int) -> tuple[Array, Array]:
     """Numerators and denominators of a masked softmax along an axis, which keeps length 1."""
     real = jnp.expand_dims(mask, (0, 3 - axis))
     logits = jnp.where(real, logits, jnp.finfo(logits.dtype).min)  # -inf gives NaN if none is real

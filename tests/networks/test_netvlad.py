@@ -92,7 +92,7 @@ def test_layer_and_patches_are_those_of_loops(order):
         sums = np.zeros((3, CHANNELS))
         for x in vectors.reshape(-1, CHANNELS):
             x = x / np.linalg.norm(x)
-            odds = np.exp(x @ kernel[0, 0])
+            odds = np.exp(x @ kernel)
             sums += (odds / odds.sum())[:, None] * (x - centers)
         sums /= np.linalg.norm(sums, axis=1, keepdims=True)
         flat = (sums if order == "clusters" else sums.T).reshape(-1)
