@@ -63,15 +63,10 @@ class Dinov2Features(NetworkExtractor):
             raise InputError(f"block={self.block}: expected from {-depth} to {depth - 1}, a block of this network")
 
     @property
-    def vector_size(self) -> int:
-        """Length of the class token."""
-        return self.model.width
-
-    @property
     def scales(self) -> tuple[Scale, ...]:
         """One scale with all patches, also if `threshold` drops some."""
         width, height = self.image_size
-        return (Scale(self.model.width, (width // PATCH) * (height // PATCH)),)
+        return (Scale(self.model.dimension, (width // PATCH) * (height // PATCH)),)
 
     def compute(self, model: VisionTransformer, images: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
         """Global descriptors `[B, D]`, local descriptors `[B, rows, columns, D]` and scores `[B, rows, columns]`."""

@@ -86,8 +86,7 @@ class _WhitenedWindows(NetworkExtractor):
     def _program(self) -> Callable[..., Any]:
         """Images -> whitened windows `[V, D']`; the whitening is an argument, so that XLA does not fold it."""
         maps, windows = self.maps, self.windows
-        whitening = learned_whitening(self)  # pyright: ignore[reportArgumentType]
-        convolution = jax.device_put(kernels(whitening, windows))
+        convolution = jax.device_put(kernels(learned_whitening(self), windows))
 
         def describe(model: SsmVgg, images: Array, kernel: Array, offset: Array) -> Array:
             return whiten_windows(maps.compute(model, images), kernel, offset, stride=windows.stride)

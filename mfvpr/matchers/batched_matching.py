@@ -132,19 +132,19 @@ def join_candidates(
     pairs: Sequence[Pair | None], no_matches: Row, count0: Any, count1: Int[np.ndarray, " candidates"] | None
 ) -> tuple[Matches, Int[np.ndarray, " candidates"]]:
     """Matches of all candidates, one after the other, and their numbers; images without a pair have 1 x 1 px."""
-    matched_pairs = [pair for pair in pairs if pair is not None]
-    parts = [pair.matches for pair in matched_pairs] or [no_matches]
-    rows = {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
-    unknown = np.ones(2, np.float32)
+    missing = Pair(no_matches, np.ones(2, np.float32), np.ones(2, np.float32))
+    real = [pair for pair in pairs if pair is not None] or [missing]
+    rows = {name: np.concatenate([pair.matches[name] for pair in real]) for name in real[0].matches}
+    pairs = [pair or missing for pair in pairs]
     matches = Matches(
         **rows,
         mask=np.ones(len(rows["points0"]), bool),
-        image_size0=matched_pairs[0].image_size0 if matched_pairs else unknown,
-        image_size1=np.array([unknown if pair is None else pair.image_size1 for pair in pairs]).reshape(-1, 2),
+        image_size0=real[0].image_size0,
+        image_size1=np.array([pair.image_size1 for pair in pairs]).reshape(-1, 2),
         count0=count0,
         count1=count1,
     )
-    return matches, np.array([0 if pair is None else len(pair.matches["points0"]) for pair in pairs], np.int32)
+    return matches, np.array([len(pair.matches["points0"]) for pair in pairs], np.int32)
 
 
 def _no_matches(queries: FeatureSet, database: FeatureSet, matcher: Matcher) -> Row:

@@ -85,10 +85,10 @@ class MatchSet:
         """
         by_query = {query: self.matches[query] for query in np.unique(queries).tolist()}
         pairs = list(zip(queries.tolist(), places.tolist(), strict=True))
+        ends = {query: np.cumsum(self.counts[query]) for query in by_query}
         rows = []
         for query, place in pairs:  # views
-            end = self._ends[query, place]
-            part = slice(end - self.counts[query, place], end)
+            part = slice(ends[query][place] - self.counts[query, place], ends[query][place])
             rows.append({name: values[part] for name, values in per_match(by_query[query]).items()})
         entries, mask = pad_rows(rows, capacity, total=total)
         for name in per_pair(by_query[pairs[0][0]]):
@@ -104,18 +104,10 @@ class MatchSet:
         return content_hash(self.counts, [content_hash(query) for query in self.matches])
 
     @cached_property
-    def _ends(self) -> Int[np.ndarray, "queries candidates"]:
-        """End of each candidate's matches among the matches of its query."""
-        return np.cumsum(self.counts, axis=1)
-
-    @cached_property
     def image_sizes(self) -> tuple[Num[np.ndarray, "pairs 2"], Num[np.ndarray, "pairs 2"]]:
         """Sizes of query and database images, in all combinations."""
-        sizes = ([query.image_size0, query.image_size1] for query in self.matches)
-        sizes0, sizes1 = (
-            np.unique(np.concatenate([np.reshape(size, (-1, 2)) for size in side]), axis=0)
-            for side in zip(*sizes, strict=True)
-        )
+        sizes = [[np.reshape(size, (-1, 2)) for size in (each.image_size0, each.image_size1)] for each in self.matches]
+        sizes0, sizes1 = (np.unique(np.concatenate(side), axis=0) for side in zip(*sizes, strict=True))
         return np.repeat(sizes0, len(sizes1), 0), np.tile(sizes1, (len(sizes0), 1))
 
 
@@ -165,9 +157,9 @@ def shapes(match_set: MatchSet, *, settings: float = math.inf) -> dict[int, int]
 def partition(
     match_set: MatchSet, queries: range, *, settings: float = math.inf
 ) -> list[tuple[Int[np.ndarray, " _"], int, int]]:
-    """Batches of all pairs of some queries that have matches; the first of each shape comes first.
+    """Batches of all pairs with matches: positions in the flattened `[queries, candidates]`, slots, pairs with padding.
 
-    A batch has positions of pairs in the flattened `[queries, candidates]`, slots of a pair, and pairs with padding.
+    The first batch of each shape comes first.
     """
     part = slice(queries.start, queries.stop)
     counts = match_set.counts[part].reshape(-1)

@@ -107,7 +107,7 @@ class VisionTransformer(nnx.Module):
         self.has_registers = registers > 0
         self.blocks = nnx.List([block(width, heads, rngs=rngs) for _ in range(depth)])
         self.norm = layers.LayerNorm(width, epsilon=_EPSILON, rngs=rngs)
-        self.width = width
+        self.dimension = width
 
     preprocess = staticmethod(layers.preprocess)
 
@@ -132,7 +132,7 @@ class VisionTransformer(nnx.Module):
         first = (self.first[...] + self.positions[...][0])[None]
         extra = jnp.concatenate([first, self.registers[...]]) if self.has_registers else first
         extra = jnp.broadcast_to(extra, (len(images), *extra.shape))
-        patches = self.patches(images).reshape(len(images), -1, self.width)
+        patches = self.patches(images).reshape(len(images), -1, self.dimension)
         states = [jnp.concatenate([extra, patches + positions[None]], axis=1)]
         for block in self.blocks:
             states.append(block(states[-1]))
@@ -190,7 +190,7 @@ class TokenDescriptor(nnx.Module):
         self.network = network
         self.pool = layers.GeneralizedMean(power)
         self.pooling = pooling
-        self.dimension = network.width
+        self.dimension = network.dimension
         self.has_components = False
 
     preprocess = staticmethod(layers.preprocess)

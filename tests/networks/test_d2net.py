@@ -7,7 +7,7 @@ import pytest
 from flax import nnx
 
 from mfvpr import InputError
-from mfvpr.features import D2NetFeatures, keypoint_networks
+from mfvpr.features import D2NetFeatures, network
 from mfvpr.features.network import compile_network
 from mfvpr.networks import D2Net
 from mfvpr.networks.d2net import detect, select, survey
@@ -207,8 +207,8 @@ def test_what_does_not_fit_is_counted_and_the_strongest_stay():
 
 @pytest.mark.parametrize("memory", [None, 1e9])  # of a CPU, of an accelerator
 def test_crowded_images_are_extracted_again(small, images, monkeypatch, memory):
-    monkeypatch.setattr(keypoint_networks, "device_bytes", lambda _: memory)
-    monkeypatch.setattr(keypoint_networks, "_SHARE", 0.01)
+    monkeypatch.setattr(network, "device_bytes", lambda _: memory)
+    monkeypatch.setattr(network, "_SHARE", 0.01)
     crowded = D2NetFeatures(small.model, small.image_size)
     for ours, expected in zip(local(crowded(images)), local(small(images)), strict=True):
         assert len(expected.scores) > 2
