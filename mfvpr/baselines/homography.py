@@ -56,8 +56,8 @@ class Homography:
         threshold: largest error of an inlier, px of the query; 8 and 24 in the paper.
         max_iterations: maximum number of samples; an array less than 1 scores NaN. Degenerate draws do not count, but
             the search ends early if almost all draws (49 of 50) are degenerate.
-        confidence: RANSAC stops once a sample of inliers only was drawn with this probability, assuming as many inliers
-            as the best model has; an array of 1 never stops early, one not above 0 scores NaN.
+        confidence: RANSAC stops once a sample of inliers only was drawn with this probability, if inliers are as many
+            as the best model's; an array of 1 never stops early, one not above 0 scores NaN.
         refit: fit the best model to its inliers by least squares, and count again, as OpenCV 5 does. OpenCV 4, of the
             paper's time, refines the homography after the count.
         few: score of less than 4 matches, `count` (re-ranking-for-VPR) or `zero` (Patch-NetVLAD); 4 matches score 4.
@@ -117,7 +117,6 @@ class Homography:
 
 @jax.custom_jvp
 def _without_gradient(values: Any) -> Any:
-    """The values; their derivative raises `NoGradientError`."""
     return values
 
 

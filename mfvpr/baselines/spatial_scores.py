@@ -132,9 +132,8 @@ class LostScore:
     1 / (e^s - 1). LoST also multiplies L by the distance of the images' global descriptors, which matches do not hold,
     and matches by channels and semantic labels.
 
-    If all distances are equal, for instance of a single match, v is 0 and L infinite, so that s = 0. Two matches are
-    always perfect: with few matches the score says little. 1 - cos is at least 1e-12, and 1 if all positions with a
-    weight are 0.
+    If all distances are equal, v is 0 and L infinite, so that s = 0. Two matches are always perfect. 1 - cos is at
+    least 1e-12, and 1 if all positions with a weight are 0.
 
     Attributes:
         form: `weighted` is the L above; `unweighted` is (1 - cos(x0, x1)) / n, LoST's program without descriptors of

@@ -15,8 +15,7 @@ from mfvpr.datasets.image_reading import Interpolation, resize
 from mfvpr.features.feature_set import FeatureSet
 from mfvpr.io.containers import shorten
 from mfvpr.io.matches import numbered_matches, point_matches
-from mfvpr.matchers.batched_matching import Pair, join_candidates
-from mfvpr.matchers.match_set import QueryMatches
+from mfvpr.matchers.match_set import Pair, QueryMatches, join_candidates
 from mfvpr.utils.errors import InputError
 from mfvpr.utils.fields import COUNT, check_fields, list_of, setting, word_of
 from mfvpr.utils.numerics import as_array
