@@ -241,10 +241,8 @@ def draw_four(key: Array, round_number: Int[Array, ""] | int, count: Int[Array, 
     return jnp.stack(numbers)
 
 
-def draw_samples(
-    points: Float[Array, "slots 4"], key: Array, round_number: Array, count: Array
-) -> tuple[Float[Array, "coordinates=4 matches=4 samples"], Int[Array, ""]]:
-    """Draw samples: (x1, y1, x0, y0) of four of the first `count` matches each, and the number of samples.
+def draw_samples(points: Float[Array, "slots 4"], key: Array, round_number: Array, count: Array) -> tuple[Array, Array]:
+    """Draw samples `[4, 4, S]`: (x1, y1, x0, y0) of four of the first `count` matches each; and their number.
 
     As in OpenCV's findHomography, a draw is rejected if no camera can see it: three of the points lie on a line in one
     image, or some but not all triangles change their orientation.
@@ -324,9 +322,7 @@ def is_inlier(model: Array, points: Array, threshold: Array) -> Array:
     return u * u + v * v <= limit * limit
 
 
-def least_squares(
-    model: Float[Array, "9"], points: Float[Array, "slots 4"], weights: Float[Array, " slots"]
-) -> Float[Array, "9"]:
+def least_squares(model: Float[Array, "9"], points: Float[Array, "slots 4"], weights: Array) -> Float[Array, "9"]:
     """Model with the least weighted squared error for matches."""
     x1, y1, x0, y0 = points.T
     plane, target, roots = jnp.stack([x1, y1, jnp.ones_like(x1)]), jnp.stack([x0, y0]), jnp.sqrt(weights)

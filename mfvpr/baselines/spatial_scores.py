@@ -169,9 +169,7 @@ class LostScore:
         return where_finite(score, confidence, x0, x1, distance)
 
 
-def _cosine_distance(
-    x0: Float[Array, " slots"], x1: Float[Array, " slots"], weights: Float[Array, " slots"]
-) -> Float[Array, ""]:
+def _cosine_distance(x0: Float[Array, " slots"], x1: Array, weights: Array) -> Float[Array, ""]:
     """1 - cos of two vectors with weights; 1 if one of the vectors is 0."""
     length0, length1 = (safe_sqrt(jnp.sum(weights * x**2)) for x in (x0, x1))
     usable = (length0 > 0) & (length1 > 0)

@@ -1,7 +1,7 @@
-"""Sources of local features, and the features that are on a device at the moment.
+"""Sources of local features (a store, a file of another program, a list), and the features that are on a device.
 
-A data set's features need not fit into memory. They stay in their source (a store, a file of another program, a list);
-only their counts are always known. Rows are read when they are matched, and stay on the device until it is full.
+A data set's features need not fit into memory: only their counts are always known. Rows are read when they are matched,
+and stay on the device until it is full.
 """
 
 import itertools
@@ -103,13 +103,9 @@ class FeatureSet:
 
 
 def memory_budget(memory: float | None, devices: Sequence[Device]) -> int:
-    """Bytes for features on each device: `memory` GB, by default a third of the free memory.
-
-    Devices without memory of their own share the host's.
-    """
-    free = free_bytes(devices[0])
-    sharing = 1 if devices[0].memory_stats() else len(devices)
-    return int((SHARE * free if memory is None else 1e9 * memory) / sharing)
+    """Bytes for features on each device: `memory` GB, by default a third of the free memory."""
+    sharing = 1 if devices[0].memory_stats() else len(devices)  # devices without memory share the host's
+    return int((SHARE * free_bytes(devices[0]) if memory is None else 1e9 * memory) / sharing)
 
 
 class Staged(NamedTuple):
@@ -124,8 +120,8 @@ class Staged(NamedTuple):
 class Slots:
     """Rows of a feature set on one device, padded, in slots of a few capacities; the least recently used makes room.
 
-    An image's capacity depends on its count and on the counts of all `wanted` images, never on the images that it is
-    matched with. `stage` reads rows, and may run ahead on another thread by two calls; `put` writes them to the device.
+    An image's capacity depends on its count and those of all `wanted` images, never on the images that it is matched
+    with. `stage` reads rows, and may run ahead on another thread by two calls; `put` writes them to the device.
     """
 
     def __init__(self, features: FeatureSet, wanted: Int[np.ndarray, " rows"], budget: int, device: Device) -> None:
@@ -227,10 +223,8 @@ def check_features(image: Features, name: str, *, unit_length: bool) -> None:
         return
     lengths = np.linalg.norm(np.asarray(image.descriptors, np.float32)[image.mask], axis=1)
     if (wrong := np.abs(lengths - 1) > 0.01).any():
-        raise InputError(
-            f"{name}: expected descriptors of unit length, got {lengths[wrong][0]:.4g}; "
-            "divide them by their Euclidean length, or say unit_length=False"
-        )
+        got = f"{lengths[wrong][0]:.4g}; divide them by their Euclidean length, or say unit_length=False"
+        raise InputError(f"{name}: expected descriptors of unit length, got {got}")
 
 
 def pad_rows(

@@ -107,9 +107,7 @@ class MixVprDescriptor(NetworkExtractor):
 
     image_size: tuple[int, int] = only_size(*IMAGE_SIZE)
     interpolation: Interpolation = setting(
-        "pil_bicubic",
-        word_of(Interpolation),
-        "the authors' demo, OpenVPRLab; pil_bilinear (training), torch_bilinear (VPR-methods-evaluation)",
+        "pil_bicubic", word_of(Interpolation), "pil_bicubic: the authors' demo; pil_bilinear: their training"
     )
 
 

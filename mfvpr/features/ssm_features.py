@@ -63,10 +63,7 @@ class SsmMaps(NetworkExtractor):
 
 @dataclass(frozen=True)
 class _WhitenedWindows(NetworkExtractor):
-    """Base of the extractors of whitened windows of a stage's maps.
-
-    `whitening` are settings to learn it from the database, or the learned whitening.
-    """
+    """Base of the extractors of whitened windows; `whitening` has settings to learn it from the database, or is it."""
 
     stage: ClassVar[Literal[1, 2]]
 
@@ -97,17 +94,13 @@ class _WhitenedWindows(NetworkExtractor):
 
 @dataclass(frozen=True)
 class SsmWindows(_WhitenedWindows):
-    """Descriptors for retrieval by votes: 36 whitened windows of 9 x 9 positions of the first stage's map.
-
-    Images have 224 x 224 px, because the map of a larger image has more windows and the public code draws 36.
-    """
+    """Descriptors for retrieval by votes: 36 whitened windows of 9 x 9 positions of the first stage's map."""
 
     stage = 1
     image_size: tuple[int, int] = only_size(224, 224)
 
     @property
     def windows(self) -> Windows:
-        """The 36 windows of a map."""
         return Windows(self.maps.shape, 9)
 
     @property
@@ -145,7 +138,6 @@ class SsmCells(_WhitenedWindows):
 
     @property
     def scales(self) -> tuple[Scale, ...]:
-        """One scale with all cells."""
         return (Scale(self.whitening.dimension, self.windows.count),)
 
     def describe_result(self, result: Float[np.ndarray, "cells dimensions"]) -> Description:

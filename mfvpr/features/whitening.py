@@ -34,7 +34,6 @@ class Whitening:
 
     @property
     def dimension(self) -> int:
-        """Number of components."""
         return len(self.components)
 
 

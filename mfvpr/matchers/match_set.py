@@ -49,17 +49,11 @@ class QueryMatches:
 
 @dataclass(frozen=True)
 class MatchSet:
-    """Matches of every query with its candidates, of one scale, without padding.
+    """Matches of every query with its candidates, of one scale, without padding."""
 
-    Attributes:
-        matches: per query, as in QueryMatches; a store may read them on access.
-        counts: matches of each candidate.
-        capacity: slots that suffice for every pair.
-    """
-
-    matches: Sequence[Matches]
-    counts: Int[np.ndarray, "queries candidates"]
-    capacity: int
+    matches: Sequence[Matches]  # per query, as in QueryMatches; a store may read them on access
+    counts: Int[np.ndarray, "queries candidates"]  # matches of each candidate
+    capacity: int  # slots that suffice for every pair
 
     @classmethod
     def of(cls, matches: Sequence[Matches], counts: Int[np.ndarray, "queries candidates"]) -> "MatchSet":
@@ -78,14 +72,7 @@ class MatchSet:
         matches = ordered_map(self.matches.__getitem__, list(queries), workers=available_cpus())
         return MatchSet(list(matches), self.counts[queries], self.capacity)
 
-    def pairs(
-        self,
-        queries: Int[np.ndarray, " pairs"],
-        places: Int[np.ndarray, " pairs"],
-        capacity: int,
-        *,
-        total: int | None = None,
-    ) -> Matches:
+    def pairs(self, queries: np.ndarray, places: np.ndarray, capacity: int, *, total: int | None = None) -> Matches:
         """Matches `[P, K, ...]` of pairs, padded with zeros to K = `capacity` slots, for `places` in the shortlists.
 
         There are `total` pairs with padding, which has no matches, and the images of the last pair.
@@ -120,17 +107,13 @@ class MatchSet:
 
 @dataclass(frozen=True)
 class Scales:
-    """Matches of every pair at several scales, such as patch sizes: one match set per scale.
+    """Matches of every pair at several scales, such as patch sizes.
 
     Functions that score a MatchSet accept Scales, too, and fuse the scores of the scales, see `fuse_scales`.
-
-    Attributes:
-        match_sets: S match sets of the same queries and candidates.
-        weights: of the scales; None = 1 each.
     """
 
-    match_sets: Sequence[MatchSet]
-    weights: Sequence[float] | None = None
+    match_sets: Sequence[MatchSet]  # one per scale, of the same queries and candidates
+    weights: Sequence[float] | None = None  # of the scales; None = 1 each
 
     @property
     def image_sizes(self) -> tuple[Num[np.ndarray, "pairs 2"], Num[np.ndarray, "pairs 2"]]:
@@ -214,9 +197,7 @@ def split_rows(flat: Row, counts: Int[np.ndarray, " rows"]) -> list[dict[str, np
     ]
 
 
-def prune_capacities(
-    capacities: Int[np.ndarray, " capacities"], counts: Int[np.ndarray, "..."], saving: float
-) -> Int[np.ndarray, " _"]:
+def prune_capacities(capacities: np.ndarray, counts: Int[np.ndarray, "..."], saving: float) -> Int[np.ndarray, " _"]:
     """The largest of ascending `capacities`, and each that saves at least `saving` slots of padding."""
     lengths = counts[counts > 0]
     while len(capacities) > 1:
@@ -300,11 +281,7 @@ def match_queries(
 
 
 def _parts(
-    counts0: Int[np.ndarray, " queries"],
-    counts1: Int[np.ndarray, " database"],
-    indices: Int[np.ndarray, "queries candidates"],
-    todo: Int[np.ndarray, " rows"],
-    sides: dict[Device, Sides],
+    counts0: np.ndarray, counts1: np.ndarray, indices: np.ndarray, todo: np.ndarray, sides: dict[Device, Sides]
 ) -> Iterator[Part]:
     """Parts of all batches, each batch on the next device; without pairs that lack keypoints."""
     for start, device in zip(range(0, len(todo), QUERIES), itertools.cycle(sides), strict=False):
