@@ -72,8 +72,7 @@ class GridAnchors:
         anchors, neighbors = (masked(index, matched, never).reshape(side, side) for never in (2**20, -(2**20)))
         neighbors = jnp.pad(neighbors, half, constant_values=_OUTSIDE[self.outside])
 
-        def count_row(row: Array, counts: Array) -> Array:
-            """Add the cells of one row of each patch that agree with its anchor."""
+        def count_row(row: Array, counts: Array) -> Array:  # of each patch
             cells = jax.lax.dynamic_slice_in_dim(neighbors, row, side)
             for column in range(self.size):
                 expected = anchors + (row - half) * side + column - half

@@ -138,8 +138,7 @@ def _search(
 ) -> tuple[Float[Array, "9"], Int[Array, ""]]:
     """RANSAC of one pair: the best model, NaN if there is none, and the number of samples.
 
-    The `number` real matches come first, in canonical order and in the coordinates of a frame. `counts` are their
-    confidences, all 1 if `each_counts_one`.
+    The `number` real matches come first, in canonical order and in a frame; `counts` are their confidences.
     """
     rounds = _ROUNDS * jnp.ceil(max_iterations / ROUND).astype(jnp.int32)
     place, every = jnp.arange(ROUND, dtype=jnp.int32), jnp.sum(counts)
@@ -312,10 +311,7 @@ def through(four: Float[Array, "coordinates=4 matches=4 samples"]) -> Float[Arra
 
 
 def is_inlier(model: Array, points: Array, threshold: Array) -> Array:
-    """Whether the distance of H p1 from p0 is at most the threshold.
-
-    Either models `[9, ...]` and one match `[4]`, or one model and matches `[K, 4]`.
-    """
+    """Whether H p1 is within the threshold of p0: models `[9, ...]` and a match `[4]`, or a model and matches."""
     x1, y1, x0, y0 = jnp.moveaxis(points, -1, 0)
     u, v, w = (model[row] * x1 + model[row + 1] * y1 + model[row + 2] for row in (0, 3, 6))
     u, v, limit = u - x0 * w, v - y0 * w, threshold * w  # both sides times the last coordinate of H p1
@@ -359,7 +355,6 @@ class Frame(NamedTuple):
         return cls(half.reshape(4), jnp.where(scale > 0, scale, 1.0))
 
     def normalize(self, points: Float[Array, "slots 4"]) -> Float[Array, "slots 4"]:
-        """Points in px, in the coordinates of the frame."""
         return (points - self.center[None]) / jnp.repeat(self.scale, 2)[None]
 
     def to_pixels(self, model: Float[Array, "9"]) -> Float[Array, "3 3"]:

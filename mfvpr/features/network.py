@@ -36,8 +36,8 @@ _SMALLEST_MAP = 2  # of D2-Net
 class NetworkExtractor:
     """Base of the extractors with a network: dataclasses whose further fields are further settings.
 
-    By default it is an extractor of the global descriptors of `model.dimension` numbers that the network returns for
-    preprocessed images. An extractor of another kind defines `compute`, `describe_result`, `vector_size` and `scales`.
+    By default it gives the global descriptors of `model.dimension` numbers that the network returns for preprocessed
+    images. An extractor of another kind defines `compute`, `describe_result`, `vector_size` and `scales`.
 
     Raises:
         InputError: another network than `network`, or a value that is out of its range.
@@ -294,11 +294,9 @@ def in_batches(
     """Results of `program` for each image, NumPy.
 
     On a CPU `batch_size` has no effect: images run one by one, which keeps activations in the caches, and two at the
-    same time, since a network leaves some of the cores idle. On other devices at most `TOGETHER` of them run at the
-    same time, and the last batch is filled up, so that there is one program.
-
-    Raises:
-        InputError: floating-point images of 0 to 1, in which every network here sees black.
+    same time, since a network leaves cores idle. On other devices at most `TOGETHER` run at the same time, and the last
+    batch is filled up, so that there is one program. Images of 0 to 1, which every network sees as black, raise an
+    `InputError`.
     """
     if images.dtype.kind == "f" and images.size and 0 < (largest := images.max()) <= 1:
         raise InputError(f"images: expected values from 0 to 255, the largest is {largest:.3g}; multiply by 255")

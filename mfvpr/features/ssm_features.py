@@ -8,7 +8,7 @@ from typing import Any, ClassVar, Literal
 
 import jax
 import numpy as np
-from jaxtyping import Float, Num
+from jaxtyping import Float
 
 from mfvpr.core.types import Array
 from mfvpr.features.extractor import Description, Scale, local_features
@@ -54,10 +54,7 @@ class SsmMaps(NetworkExtractor):
     def vector_size(self) -> int:
         return math.prod(self.shape)
 
-    def compute(
-        self, model: SsmVgg, images: Num[Array, "images height width 3"]
-    ) -> Float[Array, "images rows columns 512"]:
-        """Maps of a batch; runs in a compiled program."""
+    def compute(self, model: SsmVgg, images: Array) -> Float[Array, "images rows columns 512"]:
         return of_unit_length(model(model.preprocess(images, self.preprocessing), self.stage))
 
 

@@ -122,10 +122,8 @@ class Windows:
         """(row, column) of each window's first position."""
         return self.stride * np.stack(np.divmod(np.arange(self.count), self.grid[1]), axis=1)
 
-    def take(
-        self, image_map: Float[np.ndarray, "rows columns channels"], numbers: Int[np.ndarray, " windows"]
-    ) -> Float[np.ndarray, "windows dimensions"]:
-        """The windows `numbers` of one map."""
+    def take(self, image_map: np.ndarray, numbers: Int[np.ndarray, " windows"]) -> Float[np.ndarray, "windows _"]:
+        """The windows `numbers` of one map `[rows, columns, channels]`."""
         parts = [image_map[row : row + self.size, column : column + self.size] for row, column in self.corners[numbers]]
         return np.reshape(parts, (len(numbers), self.dimension))
 
@@ -176,11 +174,7 @@ class WindowFitting:
 
 
 def learned_whitening(extractor: Any) -> Whitening:
-    """Learned whitening of an extractor with `whitening`, `windows` and `maps`.
-
-    Raises:
-        InputError: it was not learned yet, or from something else.
-    """
+    """Learned whitening of an extractor; an `InputError` if it was not learned yet, or from something else."""
     name, whitening, expected = type(extractor).__name__, extractor.whitening, extractor.windows.dimension
     if not isinstance(whitening, Whitening):
         raise InputError(f"{name}: has not seen the database; take mfvpr.retrieval.fit_to_database(...) of it")
@@ -198,10 +192,8 @@ def origin(extractor: Any) -> str:
     return ""
 
 
-def kernels(
-    whitening: Whitening, windows: Windows
-) -> tuple[Float[np.ndarray, "size size channels dimensions"], Float[np.ndarray, " dimensions"]]:
-    """The whitening as a convolution of a map: a kernel and an offset, float32."""
+def kernels(whitening: Whitening, windows: Windows) -> tuple[np.ndarray, np.ndarray]:
+    """The whitening as a convolution of a map: a kernel `[size, size, channels, D']` and an offset `[D']`, float32."""
     components = whitening.components.reshape(-1, windows.size, windows.size, windows.shape[2])
     offset = whitening.components.astype(np.float64) @ whitening.mean
     return np.moveaxis(components, 0, -1).astype(np.float32), offset.astype(np.float32)

@@ -35,13 +35,9 @@ Calls = list[tuple[Int[np.ndarray, " pairs"], Matches]]  # (positions in the pai
 
 @dataclass(frozen=True)
 class QueryMatches:
-    """Candidates of one query, best first, and their n real matches one after the other. NumPy.
+    """Candidates of one query, best first, and their n real matches one after the other. NumPy."""
 
-    In the matches, `image_size0` `[2]` and `count0` `[]` are the query's, `image_size1` `[C, 2]` and `count1` `[C]` the
-    candidates'.
-    """
-
-    matches: Matches
+    matches: Matches  # image_size0 [2] and count0 [] are the query's, image_size1 [C, 2] and count1 [C] the candidates'
     counts: Int[np.ndarray, " candidates"]  # matches of each candidate, int32; their sum is n
     indices: Int[np.ndarray, " candidates"]  # database rows, int32, -1 = none
     filter_scores: Float[np.ndarray, " candidates"]  # float32
@@ -62,7 +58,8 @@ class MatchSet:
 
     def __getitem__(self, query: int) -> Matches:
         """Matches `[C, K, ...]` of one query, padded with zeros to the capacity."""
-        return self.pairs(np.full(self.counts.shape[1], query), np.arange(self.counts.shape[1]), self.capacity)
+        places = np.arange(self.counts.shape[1])
+        return self.pairs(np.full_like(places, query), places, self.capacity)
 
     def __len__(self) -> int:
         return len(self.matches)

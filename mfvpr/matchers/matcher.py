@@ -100,13 +100,12 @@ class LightGlueMatcher:
     `mfvpr.match`. The published weights are for ALIKED's features of 128 dimensions, and useless for other features.
 
     Attributes:
-        weights: of the network.
         network: recipe of the network that the weights belong to.
         filter_threshold: a match is kept if its assignment is larger.
         depth_confidence: skip the remaining layers of a pair once more than this share of its keypoints is confident,
             which loses a third of the matches on photographs; None = never. The public code uses 0.95 by default, and
             prunes keypoints: matches equal those of its `width_confidence=-1`.
-        chunk_size: pairs at a time, see `mfvpr.Matcher`; changes only memory, time and the last bits.
+        chunk_size: see `mfvpr.Matcher`; changes only memory, time and the last bits.
     """
 
     weights: "Packed"
@@ -139,10 +138,7 @@ class LightGlueMatcher:
         return {name: getattr(self, name) for name in ("network", "filter_threshold", "depth_confidence")}
 
     def __call__(self, features0: Features, features1: Features) -> Matches:
-        """Matches of one pair, keypoints `[N0, 2]` and `[N1, 2]`: max(N0, 1) slots, slot k is keypoint k of the query.
-
-        Descriptors of another dimension raise an `InputError`.
-        """
+        """Matches of one pair: max(N0, 1) slots, slot k is keypoint k; an `InputError` for another `dimension`."""
         from mfvpr.networks.lightglue import assignment
 
         features0, features1 = (ready(at_least_one(features)) for features in (features0, features1))
