@@ -18,7 +18,7 @@ from mfvpr.datasets import image_folder, read_image
 from mfvpr.datasets.image_reading import VIDEO_SUFFIXES, read_frames
 from mfvpr.evaluation import Confidence, System
 from mfvpr.localization import Drive, Located, Map, Route
-from mfvpr.localization.map_images import fit_to_map, read_settings, read_system
+from mfvpr.localization.map_settings import fit_to_map, read_settings, read_system
 from mfvpr.report.runs import file_names
 from mfvpr.storage.maps import Entry
 from mfvpr.systems import assembly

@@ -81,8 +81,8 @@ class DescriptorFiles(_FolderFiles):
         self, sequence: QuerySequence, database: ImageFolder, num_candidates: int, cache: FeatureCache
     ) -> RetrievalResult:
         """See `Retriever`."""
-        database_vectors = cache.once("vectors", lambda: self._read(database), database, self)
-        search = cache.once("search", lambda: self.search.fit(database_vectors), database, self)
+        database_vectors = cache.recipes.once("vectors", lambda: self._read(database), database, self)
+        search = cache.recipes.once("search", lambda: self.search.fit(database_vectors), database, self)
         query_vectors = self._read(sequence.images)
         shortlist = search.shortlist(query_vectors, database_vectors, num_candidates, excluded=sequence.excluded)
         return RetrievalResult(shortlist, {}, {})

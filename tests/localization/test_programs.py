@@ -16,7 +16,7 @@ from mfvpr.datasets import read_image
 from mfvpr.datasets.image_reading import read_frames
 from mfvpr.evaluation import write_confidences
 from mfvpr.localization import Map
-from mfvpr.localization.map_images import read_settings
+from mfvpr.localization.map_settings import read_settings
 from mfvpr.systems import assembly
 from mfvpr.utils import InputError
 from tests.localization.test_map import SURE

@@ -216,7 +216,7 @@ def _files(
     matches = [scale.fingerprint for scale in scales(match_set)]
     recipe["data"] = content_hash(fusion, matches, candidates, views)
     pack, unpack = lambda rows: {"rows": rows}, itemgetter("rows")
-    return CacheFiles(options.folder, "sweep", recipe, pack, unpack, compress=True)
+    return CacheFiles(options.folder, "sweep", recipe, pack, unpack)
 
 
 def forget_rankings(
