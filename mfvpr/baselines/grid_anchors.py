@@ -76,7 +76,7 @@ class GridAnchors:
             cells = jax.lax.dynamic_slice_in_dim(neighbors, row, side)
             for column in range(self.size):
                 expected = anchors + (row - half) * side + column - half
-                counts = counts + (cells[:, column : column + side] == expected)
+                counts = counts + (cells[:, column : column + side] == expected).astype(jnp.int32)
             return counts
 
         counts = jax.lax.fori_loop(0, self.size, count_row, jnp.zeros((side, side), jnp.int32))

@@ -323,7 +323,7 @@ def least_squares(model: Float[Array, "9"], points: Float[Array, "slots 4"], wei
     x1, y1, x0, y0 = points.T
     plane, target, roots = jnp.stack([x1, y1, jnp.ones_like(x1)]), jnp.stack([x0, y0]), jnp.sqrt(weights)
 
-    def errors_of(free: Float[Array, "8"]) -> Float[Array, " 2*slots"]:
+    def errors_of(free: Float[Array, "8"]) -> Float[Array, " errors"]:
         u, v, w = jnp.matmul(jnp.append(free, 1.0).reshape(3, 3), plane, precision=_EXACT)
         return ((jnp.stack([u, v]) / w[None] - target) * roots[None]).reshape(-1)
 
