@@ -51,7 +51,6 @@ class Retrieval:
     def shortlist(
         self, sequence: QuerySequence, database: ImageFolder, num_candidates: int, cache: FeatureCache
     ) -> RetrievalResult:
-        """See `Retriever`."""
         database_vectors = cache.vectors(database, self.describer, database, label="database")
         query_vectors = cache.vectors(sequence.images, self.describer, database, label=f"query {sequence.name}")
         search = cache.recipes.once("search", lambda: self.search.fit(database_vectors.values), database, self)
@@ -127,8 +126,6 @@ def vote(
 
 def fit_to_database(tool: Tool, database: ImageFolder, cache: FeatureCache) -> Tool:
     """Learn the parts of an extractor, a retrieval, or a dataclass of these that need a database.
-
-        cells = fit_to_database(SsmCells(model), database, cache)  # as `mfvpr.evaluate` does
 
     The cache stores learned parts, by the images' content and all settings. Parts that are learned already stay the
     same, even if from another database. Images that cannot be read or are too few raise an `InputError`.

@@ -41,7 +41,7 @@ def learned(root, streets, tmp_path_factory):
     out = tmp_path_factory.mktemp("learned")
     common = (*SHORT, f"report=[{streets[2]}]")
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(learning.comparisons, "comparison_figures", lambda *_: [])
+        patch.setattr(learning.searches, "comparison_figures", lambda *_: [])
         learning.learn(settings_of(*small(root), *common, f"also=[{streets[1]}]", f"out={out}/out", config="learn"))
     return out, results(out / "out")
 
@@ -87,7 +87,7 @@ def test_sets_of_one_map_are_not_independent(root, streets, tmp_path, capsys):
         dataset = database | {"name": name, "queries": queries["queries"], "ground_truth": "order"}
         settings = settings_of(*small(root), f"out={tmp_path}/out", dataset=dataset | {"index_file": None})
         inputs = learning.prepare(settings, evaluation.Stopwatch())
-        several.append(learning.Prepared(SimpleNamespace(name=name), inputs.contents, {}, {}))
+        several.append(learning.Prepared(SimpleNamespace(name=name), inputs))
     learning.require_disjoint([], several)
     assert capsys.readouterr().err.splitlines()[-1].startswith("warning: there and back ")
     learning.require_disjoint([], several[:1])
