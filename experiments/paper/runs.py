@@ -20,7 +20,7 @@ from mfvpr.datasets import Dataset
 from mfvpr.evaluation import Pipeline, System, rank_dataset
 from mfvpr.features import PatchNetVladFeatures, SelaVprFeatures
 from mfvpr.features.whitening import WindowExtractor
-from mfvpr.report.rendering import PAGE
+from mfvpr.report.pages import PAGE
 from mfvpr.report.run_files import ground_truth, write_run_folder
 from mfvpr.report.runs import LAST, write_about, write_json, writing
 from mfvpr.retrieval import fit_to_database
