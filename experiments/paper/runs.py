@@ -18,8 +18,7 @@ from mfvpr.cli.jobs import Inputs
 from mfvpr.cli.schema import Evaluate, Paper
 from mfvpr.datasets import Dataset
 from mfvpr.evaluation import System, rank_dataset
-from mfvpr.features import PatchNetVladFeatures, SelaVprFeatures
-from mfvpr.features.whitening import WindowExtractor
+from mfvpr.features import PatchNetVladFeatures, SelaVprFeatures, SsmCells
 from mfvpr.report.pages import PAGE
 from mfvpr.report.run_files import ground_truth, write_run_folder
 from mfvpr.report.runs import LAST, write_about, write_json, writing
@@ -35,7 +34,7 @@ from mfvpr.utils.numerics import available_cpus
 # See `input_fingerprints`, `bytes_of_an_image` and `measure_query`.
 INPUTS, SIZES, SECONDS = "made_of.json", "sizes.json", "seconds.json"
 _FLOAT, _KEYPOINT = 4, 12  # bytes of a number, and of a keypoint with its score
-_GRIDS = (WindowExtractor, PatchNetVladFeatures, SelaVprFeatures)
+_GRIDS = (SsmCells, PatchNetVladFeatures, SelaVprFeatures)
 QUERIES, DATABASE = 10, 60  # images; as many of the database as there are candidates, at least
 STEPS = ("retrieval", "features", "matching", "scores")
 _OUTPUTS = {"runs", "tables", "comparisons", PAGE}
