@@ -16,7 +16,8 @@ from mfvpr.utils.errors import InputError
 from mfvpr.utils.numerics import as_array, at_least_single, compiled, device_of, free_bytes, masked, repeat_last
 
 SHARE = 1 / 16  # of the free memory, for the similarities that exist at the same time
-ROWS = 2**16  # database rows at a time; fixed, because the last bits of the similarities depend on it
+ROWS = 2**16  # database rows at a time on a CPU; fixed, because the last bits of the similarities depend on it
+ROWS_SHARE = 1 / 4  # of an accelerator's free memory, for the database rows there
 BLOCK = 128  # database rows, of which an accelerator first looks at the largest similarity
 MAX_SAMPLES = 4096  # descriptors, evenly spread over the database, that a whitening is learned from
 
@@ -41,9 +42,13 @@ class ExactSearch:
         if excluded is not None and (len(excluded), excluded.num_database) != (len(queries), len(database)):
             expected, got = f"{len(queries)} queries and {len(database)} images", len(excluded)
             raise InputError(f"excluded: expected rows of {expected}, got {got} and {excluded.num_database}")
-        num_rows = min(len(database), ROWS)
+        device = device_of(())
+        num_rows = ROWS
+        if device.platform != "cpu":  # as many as fit, since every part costs a wait
+            num_rows = max(ROWS, int(ROWS_SHARE * free_bytes(device)) // (4 * database.shape[1]))
+        num_rows = min(len(database), num_rows)
         # Queries at a time, at least 2, with similarities that fit: 8 bytes for one and its masked copy.
-        fitting = max(2, int(SHARE * free_bytes(device_of(()))) // 8 // num_rows)
+        fitting = max(2, int(SHARE * free_bytes(device)) // 8 // num_rows)
         chunk_size = -(-len(queries) // -(-len(queries) // fitting))
         shortlists: dict[int, Shortlist] = {}  # by the first query of a chunk
         for rows in _parts(len(database), num_rows):
