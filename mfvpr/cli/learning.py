@@ -25,8 +25,7 @@ from mfvpr.tuning.learning.comparison import compare
 from mfvpr.tuning.learning.models import LOSSES, Options
 from mfvpr.tuning.learning.splits import Part, join_data_sets
 from mfvpr.tuning.learning.training import Checkpoints
-from mfvpr.tuning.sweeps import Axes
-from mfvpr.tuning.sweeps.setting_search import can_learn
+from mfvpr.tuning.sweeps import Axes, can_learn
 from mfvpr.utils import Stopwatch, recipe_of
 from mfvpr.utils.errors import InputError
 from mfvpr.utils.fields import to_values

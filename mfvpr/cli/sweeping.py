@@ -27,9 +27,16 @@ from mfvpr.retrieval import Retrieval
 from mfvpr.storage import FeatureCache
 from mfvpr.systems import assembly
 from mfvpr.systems.assembly import choices_of
-from mfvpr.tuning.sweeps import Axes, DriveRanking, Outcome, SweepOptions, search_grid, search_optuna
-from mfvpr.tuning.sweeps.setting_rankings import forget_rankings
-from mfvpr.tuning.sweeps.setting_search import require_optuna
+from mfvpr.tuning.sweeps import (
+    Axes,
+    DriveRanking,
+    Outcome,
+    SweepOptions,
+    forget_rankings,
+    require_optuna,
+    search_grid,
+    search_optuna,
+)
 from mfvpr.utils import InputError, Runtime, Stopwatch
 from mfvpr.utils.fields import NOT_NEGATIVE, check_values, list_of, to_values
 from mfvpr.utils.fields import Setting as Declared

@@ -18,7 +18,7 @@ from mfvpr.report import runs
 from mfvpr.report.plots import MARK, panels, save_figure
 from mfvpr.report.runs import Figure, file_names
 from mfvpr.report.tables import Table, data_frame, format_estimate, format_value, format_values
-from mfvpr.tuning.sweeps.setting_search import Axes, Outcome
+from mfvpr.tuning.sweeps import Axes, Outcome
 from mfvpr.utils.errors import InputError
 from mfvpr.utils.files import write_text
 from mfvpr.utils.fingerprints import versions

@@ -14,7 +14,7 @@ from tests.programs import MFVPR, QUERIES, ROOT, job_of, settings_of, small
 
 pytestmark = pytest.mark.thorough
 
-SWEEP = sys.modules["mfvpr.tuning.sweeps.setting_rankings"]
+SWEEP = sys.modules["mfvpr.tuning.sweeps"]
 
 
 @pytest.fixture(scope="session")

@@ -11,8 +11,8 @@ from mfvpr.evaluation import DriveFilter, Fusion, Ranked, statistics
 from mfvpr.features import Aggregated, Sift, VladFitting
 from mfvpr.retrieval import Retrieval
 from mfvpr.storage import FeatureCache
+from mfvpr.tuning import sweeps as rankings
 from mfvpr.tuning.sweeps import DriveRanking
-from mfvpr.tuning.sweeps import setting_rankings as rankings
 
 pytestmark = pytest.mark.slow
 

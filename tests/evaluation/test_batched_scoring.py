@@ -16,7 +16,7 @@ from mfvpr.tuning import sweeps
 from tests import oracles
 from tests.programs import ROOT
 from tests.scorers import plain
-from tests.tuning.sweeps.test_sweep import CANDIDATES, QUERIES, make_set, rank
+from tests.tuning.test_sweep import CANDIDATES, QUERIES, make_set, rank
 
 pytestmark = pytest.mark.thorough
 

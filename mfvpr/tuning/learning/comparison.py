@@ -16,8 +16,7 @@ from mfvpr.matchers.match_set import MatchSet
 from mfvpr.tuning.learning.models import Model, Options, train
 from mfvpr.tuning.learning.splits import TrainingSplit, training_splits
 from mfvpr.tuning.learning.training import Checkpoints, Fit
-from mfvpr.tuning.sweeps.setting_rankings import FUSION, Setting, SweepOptions, rank_settings
-from mfvpr.tuning.sweeps.setting_search import Axes, can_learn
+from mfvpr.tuning.sweeps import FUSION, Axes, Setting, SweepOptions, can_learn, rank_settings
 from mfvpr.utils.errors import InputError
 from mfvpr.utils.runtime import DEFAULT_RUNTIME, Runtime
 
