@@ -21,8 +21,7 @@ from mfvpr.matchers import Scales
 from mfvpr.report import comparisons, runs
 from mfvpr.report.run_files import matched_content
 from mfvpr.systems.assembly import without
-from mfvpr.tuning.learning.comparison import compare
-from mfvpr.tuning.learning.models import LOSSES, Options
+from mfvpr.tuning.learning.models import LOSSES, Options, compare
 from mfvpr.tuning.learning.splits import Part, join_data_sets
 from mfvpr.tuning.learning.training import Checkpoints
 from mfvpr.tuning.sweeps import Axes, can_learn
@@ -150,7 +149,7 @@ def _checkpoints(settings: Learn, axes: Axes, data: Part, sets: list[Prepared]) 
         "tolerances": to_values(settings.recall),
         **{name: getattr(settings, name) for name in (*_TRAINING, "loss", "inputs")},
         "retrieval_score": settings.fusion.retrieval_score,
-        "positives": data.protocol.fingerprint,
+        "positives": recipe_of([*data.protocol.positives]),
         "reported": dict(data.protocol.reported_sets),
         "versions": {**{name: versions()[name] for name in ("mfvpr", "jax", "numpy")}, "optax": version("optax")},
     }

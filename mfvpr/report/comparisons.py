@@ -15,7 +15,7 @@ from mfvpr.evaluation.statistics import mcnemar, path_test, recall_interval
 from mfvpr.report.plots import MARK, PALE, panels, save_figure
 from mfvpr.report.runs import Figure
 from mfvpr.report.tables import Table, format_interval, format_values
-from mfvpr.tuning.learning.comparison import Comparison
+from mfvpr.tuning.learning.models import Comparison
 from mfvpr.tuning.learning.training import Fit
 
 

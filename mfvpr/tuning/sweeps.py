@@ -41,14 +41,13 @@ from mfvpr.datasets.positives import Positives
 from mfvpr.evaluation.drives import DriveFilter
 from mfvpr.evaluation.protocol import EvaluationProtocol, Half, best_setting
 from mfvpr.evaluation.rankings import Ranked, RetrievalScore, Scores, Ties, fuse, retrieval_scores
-from mfvpr.evaluation.stages import PaddedBatch, all_batches, fuse_all, require_finite, run_batches
+from mfvpr.evaluation.stages import all_batches, fuse_all, pair_scores, require_finite
 from mfvpr.evaluation.statistics import Estimate, McNemar, PathTest, estimate, mcnemar, path_test
 from mfvpr.matchers.match_set import MatchSet, Scales, partition, queries_that_fit, scales
 from mfvpr.storage.cache_files import CacheFiles
 from mfvpr.utils.errors import InputError
 from mfvpr.utils.fields import Setting as Declared
 from mfvpr.utils.fingerprints import content_hash, fingerprint, recipe_of, versions
-from mfvpr.utils.numerics import Device
 from mfvpr.utils.runtime import DEFAULT_RUNTIME, Runtime
 
 if TYPE_CHECKING:
@@ -73,11 +72,9 @@ class Axes:
     Attributes:
         scorer: its other parameters stay.
         values: distinct values by name. A name is a field of the scorer, `max_distance` of matches (None = any), or `c`
-            of the fusion with retrieval ("auto" = balanced). Values of declared fields are plain
-            (`mfvpr.core.scorer`: a weight is the word `fs`, no limit is None). Words stand for weights in every
-            scorer.
-        own_values: by name, the plain value without a sweep. Default: the scorer's, no limit of `max_distance`, and
-            c = 0.
+            of the fusion with retrieval ("auto" = balanced). Values are plain: a weight is the word `fs`, no limit is
+            None.
+        own_values: plain values without a sweep. Default: the scorer's, no limit of `max_distance`, and c = 0.
 
     Raises:
         InputError: an axis without values or with equal ones, an unknown word, or a name that the scorer does not have.
@@ -102,13 +99,12 @@ class Axes:
             if len({*values[name]}) < max(1, len(values[name])):
                 raise InputError(f"{name}={axis!r}: expected different values, in a list")
         object.__setattr__(self, "values", values)
-        chosen = self.own_values
-        own_values = {name: chosen[name] if name in chosen else self._own_value(name) for name in values}
+        own_values = {name: self.own_values.get(name, self._own_value(name)) for name in values}
         object.__setattr__(self, "own_values", own_values)
-        for name, value in ((name, value) for name, axis in values.items() for value in axis):  # before any work
-            setting = self.setting({name: value})
-            if name in self.parameters and type(scorer) in SCORERS.values():
-                check_bounds(with_parameters(scorer, setting))
+        for name, axis in values.items():  # before any work
+            for setting in [self.setting({name: value}) for value in axis]:
+                if name in self.parameters and type(scorer) in SCORERS.values():
+                    check_bounds(with_parameters(scorer, setting))
 
     @property
     def parameters(self) -> Mapping[str, Declared]:
@@ -224,11 +220,8 @@ def rank_settings(
         settings: values by name, the same names in each but for `c`: fields of the scorer (numbers are batch axes; each
             value of a static field has its own program), `weight` (a Weight), `max_distance` of matches, and `c` of the
             fusion with retrieval (None = balanced). Without `c` the score alone ranks.
-        match_set: matches of queries with their candidates; several scales are scored one by one and fused over the
-            candidates that are ranked.
-        candidates: their shortlist.
+        match_set: matches of queries with their candidates; several scales are fused over the candidates of a view.
         views: candidates that are ranked; by default one view, all of the shortlist.
-        options: depth and ties of the rankings, sizes of blocks and their folder, and the runtime.
 
     Raises:
         InputError: a setting that cannot be scored, or the folder cannot be used.
@@ -239,18 +232,21 @@ def rank_settings(
     size = num_queries if options.sequence else options.queries_per_block or queries_that_fit(match_set, at_once)
     parts = [range(num_queries)[start : start + size] for start in range(0, num_queries, max(1, size))]
     rows = np.full((len(settings), len(views), num_queries, max(options.ks)), -1, np.int32)
-    files, is_ranked = _files(scorer, settings, match_set, candidates, views, options), np.zeros(len(settings), bool)
-    keys = [] if files is None else [fingerprint(recipe_of(setting)) for setting in settings]
+    files, keys = _files(scorer, settings, (match_set, candidates, views), options)
+    missing = []
     for number, key in enumerate(keys):
-        if (stored := files and files.get(key)) is not None:
-            rows[number], is_ranked[number] = stored, True
-    missing = np.flatnonzero(~is_ranked).tolist()
+        if files is None or (stored := files.get(key)) is None:
+            missing.append(number)
+        else:
+            rows[number] = stored
     by_retrieval = retrieval_scores(candidates, options.retrieval_score)
 
     # Settings that differ in c alone share their scores.
     names = [name for name in settings[0] if name != FUSION]
-    by_score = list(_group(missing, lambda number: _items(settings[number], names)).values())
-    scored = [{name: settings[first][name] for name in names} for first, *_ in by_score]
+    alone = [{name: setting[name] for name in names} for setting in settings]
+    key_of = lambda number: tuple(id(v) if name == "weight" else v for name, v in alone[number].items())  # noqa: E731
+    by_score = list(_group(missing, key_of).values())
+    scored = [alone[first] for first, *_ in by_score]
     groups = list(group_by_program(scorer, scored, match_set.image_sizes))
     share = len(scored) / len(groups) if groups else 1  # settings of a program: with more, batches are smaller
     pairs = f"{int(candidates.mask.sum()):,} pairs of {num_queries:,} queries with their candidates"
@@ -259,13 +255,17 @@ def rank_settings(
     batches_of = lru_cache(maxsize=1)(lambda queries: list(all_batches(match_set, queries, settings=share)))
     batches_of_block = sum(len(partition(each, part, settings=share)) for part in parts for each in scales(match_set))
     total = len(blocks) * batches_of_block
+    program = lambda matches, scorer, *values: score_settings(scorer, matches, *values)  # noqa: E731
     ticks = iter(options.runtime.progress(options.label)(range(total), total))
     for block in blocks:
         of_block, firsts = np.unique(block.rows, return_index=True)  # the last block of a program repeats settings
         for queries in parts:
             part = slice(queries.start, queries.stop)
-            shape = len(scales(match_set)), len(queries), candidates.mask.shape[1]
-            scores = block_scores(block, batches_of(queries), shape, options.runtime.devices, ticks)[:, firsts]
+            shape = block.rows.size, len(scales(match_set)), len(queries), candidates.mask.shape[1]
+            inputs, batches = (block.scorer, block.settings, block.weightings), batches_of(queries)
+            scores = pair_scores(program, inputs, batches, shape, options.runtime.devices, ticks)[firsts]
+            for of_setting in scores:
+                require_finite("a setting of the sweep", of_setting)
             for view, mask in enumerate(views):
                 seen = Shortlist(candidates.indices[part], candidates.scores[part], mask[part])
                 for row, of_setting in zip(of_block, fuse_all(match_set, scores, seen.mask), strict=True):
@@ -289,62 +289,28 @@ def _first_rows(
     return rows[:, : max(options.ks)]
 
 
-def block_scores(
-    block: "Group",
-    batches: Sequence[PaddedBatch],
-    shape: tuple[int, int, int],
-    devices: Sequence[Device] | None,
-    ticks: Iterator[Any],
-) -> Float[np.ndarray, "scales settings queries candidates"]:
-    """Scores of every scale, settings by weightings; a pair without matches scores 0. Each batch takes a tick."""
-    scores = np.zeros((block.rows.size, math.prod(shape)), np.float32)
-    inputs = block.scorer, block.settings, block.weightings
-    program = lambda matches, scorer, *values: score_settings(scorer, matches, *values)  # noqa: E731
-    for places, values in run_batches(program, inputs, batches, devices=devices):
-        next(ticks, None)
-        scores[:, places] = values.reshape(-1, len(places))
-    for of_setting in scores:
-        require_finite("a setting of the sweep", of_setting)
-    return np.moveaxis(scores.reshape(-1, *shape), 1, 0)
-
-
 def _files(
-    scorer: Any,
-    settings: Sequence[Setting],
-    match_set: MatchSet | Scales,
-    candidates: Shortlist,
-    views: Views,
-    options: SweepOptions,
-) -> CacheFiles[np.ndarray] | None:
-    """Files of rows `[views, queries, depth]` by setting, in a folder named by what is swept; None if none are kept."""
+    scorer: Any, settings: Sequence[Setting], data: tuple[MatchSet | Scales, Shortlist, Views], options: SweepOptions
+) -> tuple[CacheFiles[np.ndarray] | None, list[str]]:
+    """Files of rows `[views, queries, depth]` in a folder named by what is swept, and the key of each setting.
+
+    There are no files without a folder, or if a part of the sweep has no recipe.
+    """
+    no_keys = [""] * len(settings)
     if options.folder is None:
-        return None
+        return None, no_keys
     try:
-        recipe_of(settings)
         recipe = {"scorer": recipe_of(scorer), "versions": recipe_of(versions())}
         recipe["rows"] = recipe_of([max(options.ks), options.ties, options.retrieval_score, options.sequence])
+        keys = [fingerprint(recipe_of(setting)) for setting in settings]
     except TypeError as error:
         options.runtime.log(f"{options.label}: no results are kept in {options.folder}, as there is no recipe: {error}")
-        return None
+        return None, no_keys
+    match_set, candidates, views = data
     fusion = f"scales of {match_set.weights}" if isinstance(match_set, Scales) else "one scale"
-    matches = [scale.fingerprint for scale in scales(match_set)]
-    recipe["data"] = content_hash(fusion, matches, candidates, views)
+    recipe["data"] = content_hash(fusion, [scale.fingerprint for scale in scales(match_set)], candidates, views)
     pack, unpack = lambda rows: {"rows": rows}, itemgetter("rows")
-    return CacheFiles(options.folder, "sweep", recipe, pack, unpack, compress=True)
-
-
-def forget_rankings(
-    scorer: Any,
-    settings: Sequence[Setting],
-    match_set: MatchSet | Scales,
-    candidates: Shortlist,
-    views: Views,
-    options: SweepOptions,
-) -> None:
-    """Remove the rows of a finished sweep from its folder, as changed code may rank otherwise."""
-    if (files := _files(scorer, settings, match_set, candidates, views, options)) is not None:
-        for setting in settings:
-            files.path(fingerprint(recipe_of(setting))).unlink(missing_ok=True)
+    return CacheFiles(options.folder, "sweep", recipe, pack, unpack, compress=True), keys
 
 
 class Verdict(NamedTuple):
@@ -397,16 +363,23 @@ class Outcome:
         """Number of the best setting by the mean recall of the halves."""
         return best_setting(self._tuning.mean(axis=0), self.axes.values if self.is_grid else None)
 
+    def forget_rankings(self, match_set: MatchSet | Scales, candidates: Shortlist, options: SweepOptions) -> None:
+        """Remove the rows of this finished sweep from its folder, as changed code may rank otherwise."""
+        settings, data = map(self.axes.setting, self.settings), (match_set, candidates, self.protocol.views)
+        files, keys = _files(self.axes.scorer, [*settings], data, options)
+        if files is not None:
+            for key in keys:
+                files.path(key).unlink(missing_ok=True)
+
     @cached_property
     def report(self) -> list[Verdict]:
         """Verdicts by threshold, on the queries to report on."""
         chosen_hits = self.protocol.reported_hits(self.rows, self.chosen)
         own_hits = self.protocol.reported_hits(self.rows, [self.own] * len(self.chosen))
-        verdicts = []
-        for threshold, first, second in zip(self.protocol.thresholds, chosen_hits, own_hits, strict=True):
-            tests = mcnemar(first, second), path_test(first, second)
-            verdicts.append(Verdict(threshold, len(first), estimate(first), estimate(second), *tests))
-        return verdicts
+        return [
+            Verdict(threshold, len(ours), estimate(ours), estimate(own), mcnemar(ours, own), path_test(ours, own))
+            for threshold, ours, own in zip(self.protocol.thresholds, chosen_hits, own_hits, strict=True)
+        ]
 
 
 def search_grid(
@@ -513,38 +486,30 @@ def group_by_program(
 ) -> Iterator[Group]:
     """Group settings, with the same names in each, by program: each value of a static parameter, and None, has one."""
     static, integers = static_names(scorer), {*whole_numbers(scorer), "weight"}
-    weights = list({id(setting["weight"]): setting["weight"] for setting in settings if "weight" in setting}.values())
-    number = {id(weight): place for place, weight in enumerate(weights)}
-
-    def arrays(rows: Iterable[int], names: Iterable[str]) -> dict[str, np.ndarray]:
-        """Values by name; a match weight is its number among `weights`."""
-        columns = {name: [settings[row][name] for row in rows] for name in names}
-        if "weight" in columns:
-            columns["weight"] = [number[id(weight)] for weight in columns["weight"]]
-        return {name: np.array(column, int if name in integers else np.float32) for name, column in columns.items()}
-
-    is_choice = lambda name, value: name in static or value is None  # noqa: E731
-    choices_of = lambda setting: [name for name, value in setting.items() if is_choice(name, value)]  # noqa: E731
-    by_choices = _group(range(len(settings)), lambda row: _items(settings[row], choices_of(settings[row])))
+    weights = {id(setting["weight"]): setting["weight"] for setting in settings if "weight" in setting}
+    numbers = {key: number for number, key in enumerate(weights)}  # of match weights, which take the place of them
+    plain = [{**each, "weight": numbers[id(each["weight"])]} if weights else each for each in settings]
+    pick = lambda row, names: tuple(plain[row][name] for name in names)  # noqa: E731
+    column = lambda name, rows: np.array(  # noqa: E731
+        [plain[row][name] for row in rows], int if name in integers else np.float32
+    )
+    is_choice = lambda item: item[0] in static or item[1] is None  # noqa: E731
+    by_choices = _group(range(len(plain)), lambda row: tuple(filter(is_choice, plain[row].items())))
     for choices, members in by_choices.items():
         chosen = with_parameters(scorer, dict(choices))
         if weights:
-            chosen = replace(chosen, weight=ChosenWeight(tuple(weights), 0))
+            chosen = replace(chosen, weight=ChosenWeight(tuple(weights.values()), 0))
         chosen = with_static_functions(chosen)
         # Split the members into products `[G, W]` of settings and weightings.
-        names = [name for name in settings[members[0]] if name not in dict(choices)]
+        names = [name for name in plain[members[0]] if name not in dict(choices)]
         inner, outer = ([name for name in names if (name in MATCH_AXES) == is_inner] for is_inner in (True, False))
-        lines = _group(members, lambda row: _items(settings[row], outer)).values()  # noqa: B023
-        products = _group(lines, lambda line: tuple(_items(settings[row], inner) for row in line))  # noqa: B023
+        lines = _group(members, lambda row: pick(row, outer)).values()  # noqa: B023
+        products = _group(lines, lambda line: tuple(pick(row, inner) for row in line))  # noqa: B023
         for rows in map(np.array, products.values()):
-            values, weightings = arrays(rows[:, 0], outer), arrays(rows[0], inner)
+            values = {name: column(name, rows[:, 0]) for name in outer}
+            weightings = {name: column(name, rows[0]) for name in inner}
             for fitted, part in by_capacity(chosen, values, len(rows), *image_sizes):
                 yield Group(fitted, {name: axis[part] for name, axis in values.items()}, weightings, rows[part])
-
-
-def _items(setting: Setting, names: Iterable[str]) -> tuple[tuple[str, Any], ...]:
-    """Names and values to compare; match weights are equal if they are the same object."""
-    return tuple((name, id(setting[name]) if name == "weight" else setting[name]) for name in names)
 
 
 def _group(items: Iterable[Item], key: Callable[[Item], Any]) -> dict[Any, list[Item]]:

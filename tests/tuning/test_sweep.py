@@ -142,8 +142,8 @@ def test_views_hide_candidates_and_ties_may_go_by_index(data):
 def block_scores(monkeypatch):
     """Scores of every block that the test computes."""
     computed, module = [], vars(sys.modules["mfvpr.tuning.sweeps"])
-    scores = module["block_scores"]
-    monkeypatch.setitem(module, "block_scores", lambda *inputs: computed.append(scores(*inputs)) or computed[-1])
+    scores = module["pair_scores"]
+    monkeypatch.setitem(module, "pair_scores", lambda *inputs: computed.append(scores(*inputs)) or computed[-1])
     return computed
 
 

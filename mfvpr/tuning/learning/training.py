@@ -30,13 +30,13 @@ class Record(NamedTuple):
 
     step: int  # number of steps before it
     loss: float | None  # mean over the steps since the previous record; None before the first step
-    validation: float | None  # its result, smaller = better; None without `validate`
+    validation: float  # its result, smaller = better
 
 
 class Fit(NamedTuple):
     """The result of a training."""
 
-    parameters: Any  # of the best validation, which may be the start; the last ones without validation
+    parameters: Any  # of the best validation, which may be the start
     step: int  # number of steps that lead to them
     history: tuple[Record, ...]  # every validation, the start first
     ended: str  # why the training ended, in words
@@ -77,10 +77,8 @@ class State:
 
     @property
     def best_record(self) -> Record:
-        """The first record with the smallest validation; the last record without validation."""
-        validations = [(record.validation, record.step, record) for record in self.history]
-        known = [each for each in validations if each[0] is not None]
-        return min(known)[-1] if known else self.history[-1]
+        """The first record with the smallest validation."""
+        return min(self.history, key=lambda record: record.validation)
 
     def is_out_of(self, patience: int | None) -> bool:
         """Whether so many validations had no gain."""
@@ -93,7 +91,7 @@ def fit(
     batches: Callable[[int], Any],
     schedule: Schedule,
     *,
-    validate: Callable[[Any], float] | None = None,
+    validate: Callable[[Any], float],
     checkpoints: Checkpoints | None = None,
     track: Track = no_progress,
 ) -> Fit:
@@ -104,7 +102,6 @@ def fit(
         objective: parameters and a batch -> loss `[]`; compiled once per shape of the batches.
         batches: a step, counted from 0, -> its batch; the same batch in every call.
         validate: parameters -> a number, smaller = better.
-        track: progress over the steps.
 
     Raises:
         InputError: the folder cannot be used, or has a checkpoint of more steps of this training.
@@ -123,8 +120,8 @@ def fit(
 
     def add_record(state: State) -> State:
         loss = float(np.mean(state.losses)) if state.losses else None
-        value = None if validate is None else float(validate(state.parameters))
-        if value is not None and not math.isfinite(value):
+        value = float(validate(state.parameters))
+        if not math.isfinite(value):
             raise _not_finite("the validation", state.step)
         added = replace(state, history=(*state.history, Record(state.step, loss, value)), losses=())
         return replace(added, best=state.parameters) if added.best_record is added.history[-1] else added
@@ -177,8 +174,8 @@ def _files(checkpoints: Checkpoints, start: State) -> CacheFiles[State]:
     def unpack(arrays: Arrays) -> State:
         history, losses = json.loads(arrays["record"].tobytes())
         leaves = [arrays[str(place)] for place in range(len(arrays) - 1)]
-        trees = _strong(jax.tree.unflatten(jax.tree.structure(_trees(start)), leaves))
-        return State(*trees, tuple(Record(*row) for row in history), tuple(losses))
+        parameters, best, optimizer = _strong(jax.tree.unflatten(jax.tree.structure(_trees(start)), leaves))
+        return State(parameters, best, optimizer, tuple(Record(*row) for row in history), tuple(losses))
 
     return CacheFiles(checkpoints.folder, checkpoints.name, checkpoints.recipe, pack, unpack)
 
