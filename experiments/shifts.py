@@ -20,8 +20,8 @@ from mfvpr.cli.command_line import load_system
 from mfvpr.cli.programs import Parser, run_command
 from mfvpr.datasets import folder
 from mfvpr.datasets.streets import TRUTH
-from mfvpr.datasets.streets.camera import LANE, SPACING, plan_drives
-from mfvpr.datasets.streets.drawing import Drive, draw_drives
+from mfvpr.datasets.streets.drawing import SPACING, Drive, draw_drives, plan_drives
+from mfvpr.datasets.streets.scene import LANE
 from mfvpr.evaluation import System
 from mfvpr.evaluation.stages import dominant_shifts, match
 from mfvpr.evaluation.system import folders_of

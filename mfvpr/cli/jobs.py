@@ -14,7 +14,7 @@ from mfvpr.cli.console import tell, track, warn
 from mfvpr.cli.schema import Common, RecallSettings
 from mfvpr.core.types import Shortlist
 from mfvpr.datasets import Dataset, IndexFile, LabelFiles, QuerySequence
-from mfvpr.datasets.contents import Contents, fingerprints, own_rows, readings
+from mfvpr.datasets.contents import Contents, fingerprints, own_rows
 from mfvpr.datasets.ground_truth import CHOICES, threshold_words
 from mfvpr.datasets.published import published_dataset, published_differences
 from mfvpr.datasets.streets import CONDITIONS, TRUTH, streets_folder
@@ -196,7 +196,7 @@ def _warn_of_data(dataset: Dataset, contents: Mapping[str, Contents], thresholds
         warn(f"{dataset.name}: {difference}; its numbers are not comparable")
     for sequence, images in zip(dataset.sequences, [*contents.values()][1:], strict=True):
         _warn_of_sequence(sequence, sum(map(bool, own_rows(images, contents["database"]))), thresholds)
-    largest = max(reading["largest_16bit"] or 0 for reading in readings(contents).values())
+    largest = max(file.largest for images in contents.values() for file in images.files)
     used, bits = max(largest.bit_length(), 8), dataset.database.bits
     if largest and bits is not None and not bits - 1 <= used <= bits:
         look = "dark" if used < bits else "cut off"

@@ -15,7 +15,7 @@ from mfvpr.cli.console import warn
 from mfvpr.cli.jobs import cache_of, prepare, truth_in_words, with_image_size
 from mfvpr.cli.schema import Learn
 from mfvpr.cli.sweeping import axes_of
-from mfvpr.datasets.contents import Contents, fingerprints, own_rows, readings
+from mfvpr.datasets.contents import Contents, fingerprints, own_rows
 from mfvpr.evaluation.protocol import Split
 from mfvpr.matchers import Scales
 from mfvpr.report import comparisons, runs
@@ -109,7 +109,6 @@ def _prepare(settings: Learn, dataset: Mapping[str, Any], is_whole: bool, watch:
         "dataset": inputs.dataset.name,
         "ground_truth": inputs.ground_truth,
         "data_fingerprint": fingerprints(inputs.contents),
-        "reading": readings(inputs.contents),
     }
     return Prepared(
         Part(label(dataset), protocol, matches, candidates), inputs.contents, inputs.matches_recipe(), about

@@ -13,7 +13,7 @@ from mfvpr.cli.schema import Sweep as Settings
 from mfvpr.core import Scorer
 from mfvpr.core.scorer import numbers_by_name, static_names
 from mfvpr.datasets import Dataset
-from mfvpr.datasets.contents import fingerprints, readings
+from mfvpr.datasets.contents import fingerprints
 from mfvpr.evaluation import Pipeline, System, evaluation_protocol, match_sequence
 from mfvpr.evaluation.drives import DriveFilter
 from mfvpr.evaluation.protocol import Split
@@ -74,7 +74,6 @@ def sweep_program(settings: Settings) -> None:
         results = {
             "dataset": inputs.dataset.name,
             "data_fingerprint": fingerprints(inputs.contents),
-            "reading": readings(inputs.contents),
             **{name: values[name] for name in names},
             "ground_truth": inputs.ground_truth,
             **sweeps.sweep_json(outcome),

@@ -1,4 +1,4 @@
-"""Hashes and headers of image files, remembered between runs, so that unchanged files are not read again.
+"""Hashes and largest values of image files, remembered between runs, so that unchanged files are not read again.
 
 A file is unchanged if its path, size, both times and inode number are, and if the times were old enough when it was
 read: a file that is written twice within one tick of the clock keeps its times.
@@ -17,21 +17,20 @@ from pathlib import Path, PurePath
 from typing import Any
 
 from mfvpr.datasets.datasets import ImageFolder, OwnRows
-from mfvpr.datasets.image_reading import read_header
+from mfvpr.datasets.image_reading import largest_16bit
 from mfvpr.utils.files import IMAGE_SUFFIXES, write_text
 from mfvpr.utils.runtime import ordered_map
 
-FORMAT = 2  # of the record files: raise it when they change
+FORMAT = 3  # of the record files: raise it when they change
 SETTLED = 2_000_000_000  # ns; the coarsest clock of a file system (FAT) ticks every two seconds
 
 
 @dataclass(frozen=True)
 class Content:
-    """Hash and header (`read_header`) of one file."""
+    """Hash and largest value of one file."""
 
     sha256: str = ""  # of all bytes; "" = the file cannot be read
-    orientation: int = 1
-    largest: int | None = None
+    largest: int = 0  # see `largest_16bit`
 
 
 @dataclass(frozen=True)
@@ -43,7 +42,7 @@ class Contents:
 
     @cached_property
     def fingerprint(self) -> str:
-        """SHA-256 over names, contents and applied conversions; the first 16 hexadecimal digits."""
+        """SHA-256 over names, contents and conversions; the first 16 hexadecimal digits."""
         digest = hashlib.sha256()
         for name, file in zip(self.folder.names, self.files, strict=True):
             digest.update(name.encode("utf-8", "surrogateescape") + b"\0" + self._pixels(file))
@@ -51,39 +50,24 @@ class Contents:
 
     @property
     def keys(self) -> list[str]:
-        """SHA-256 of each image's content and applied conversions; the first 32 hexadecimal digits."""
+        """SHA-256 of each image's content and conversions; the first 32 hexadecimal digits."""
         return [hashlib.sha256(self._pixels(file)).hexdigest()[:32] for file in self.files]
 
     def _pixels(self, file: Content) -> bytes:
         content = bytes.fromhex(file.sha256) if file.sha256 else b"unreadable"
-        turned = b"\0turned" if self.folder.orient and file.orientation != 1 else b""
-        return content + turned + (b"" if file.largest is None else f"\0bits={self.folder.bits}".encode())
+        ways = self.folder.orient, self.folder.bits
+        return content if ways == (True, 16) else content + f"\0{ways}".encode()
 
     @cached_property
     def sha256(self) -> str:
         """SHA-256 over the contents without names; the first 16 hexadecimal digits."""
         return hashlib.sha256("".join(file.sha256 for file in self.files).encode()).hexdigest()[:16]
 
-    def summary(self) -> dict[str, int | bool | None]:
-        """Numbers of images that are turned and scaled when they are read, for results."""
-        largest = [file.largest for file in self.files if file.largest is not None]
-        return {
-            "orient": self.folder.orient,
-            "turned": sum(file.orientation != 1 for file in self.files) if self.folder.orient else 0,
-            "bits": self.folder.bits,
-            "scaled_16bit": len(largest) if self.folder.bits is not None else 0,
-            "largest_16bit": max(largest, default=None),
-        }
-
 
 def contents(folder: ImageFolder, cache: Path | str | None = None) -> Contents:
-    """The contents of the files of `folder`.
+    """The contents of the files of `folder`, `contents(mfvpr.datasets.image_folder("day/")).fingerprint`.
 
-        contents(mfvpr.datasets.image_folder("day/")).fingerprint
-
-    Args:
-        cache: folder of the record files; None = all files are read. A record file that is damaged, or that another
-            process replaces meanwhile, costs time only.
+    `cache` is the folder of the record files; None = all files are read. A damaged record file costs time only.
     """
     root = folder.root.absolute()
     name = f"{hashlib.sha256(os.fsencode(root)).hexdigest()[:32]}-{FORMAT}.json"
@@ -110,17 +94,8 @@ def fingerprints(contents: Mapping[str, Contents]) -> dict[str, str]:
     return {side: folder.fingerprint for side, folder in contents.items()}
 
 
-def readings(contents: Mapping[str, Contents]) -> dict[str, dict[str, Any]]:
-    """Summaries of how the images of each side were read, as results store them."""
-    return {side: folder.summary() for side, folder in contents.items()}
-
-
 def own_rows(queries: Contents, database: Contents) -> OwnRows:
-    """For each of the `queries`, the rows of files in the `database` with the same content.
-
-    Example:
-        own_rows(contents(data.queries), contents(data.database))
-    """
+    """For each of the `queries`, the rows of files in the `database` with the same content."""
     rows = defaultdict(list)
     for row, file in enumerate(database.files):
         rows[file.sha256].append(row)
@@ -154,4 +129,4 @@ def read_content(path: Path) -> Content:
         content = path.read_bytes()
     except OSError:
         return Content()  # reading the image raises
-    return Content(hashlib.sha256(content).hexdigest(), *read_header(content))
+    return Content(hashlib.sha256(content).hexdigest(), largest_16bit(content))

@@ -32,23 +32,18 @@ MEANS = ("mean", "pooled")  # names in results of the means over sequences, and 
 class IndexFile:
     """Ground truth of a file of pairs or positions, see `mfvpr.datasets.ground_truth.truth_from_file`.
 
-        data = mfvpr.datasets.folder("day/", "night/", ground_truth=mfvpr.datasets.IndexFile("pairs.csv"))
-
-    Attributes:
-        path: of the file; for several sequences, in the folder of each.
-        is_widened: whether database images within a tolerance in frames are correct as well.
+    data = mfvpr.datasets.folder("day/", "night/", ground_truth=mfvpr.datasets.IndexFile("pairs.csv"))
     """
 
-    path: Path | str
-    is_widened: bool = False
+    path: Path | str  # for several sequences, in the folder of each
+    is_widened: bool = False  # whether database images within a tolerance in frames are correct as well
 
 
 @dataclass(frozen=True)
 class LabelFiles:
     """Ground truth of two files of labels, see `mfvpr.datasets.ground_truth.truth_from_labels`.
 
-    Example:
-        labels = mfvpr.datasets.LabelFiles(queries="night.csv", database="day.csv")
+    labels = mfvpr.datasets.LabelFiles(queries="night.csv", database="day.csv")
     """
 
     queries: Path | str
@@ -60,16 +55,14 @@ GroundTruth = IndexFile | LabelFiles | Truth
 
 @dataclass(frozen=True, repr=False)
 class ImageFolder:
-    """Images below `root`: `names` are relative POSIX paths in natural order (image2 before image10).
+    """Images below `root`.
 
-        mfvpr.datasets.image_folder("day/").read(0)  # [H, W, 3] uint8 RGB
-
-    `orient` and `bits` are those of `mfvpr.datasets.image_reading.read_image`.
+    mfvpr.datasets.image_folder("day/").read(0)  # [H, W, 3] uint8 RGB
     """
 
     root: Path
-    names: tuple[str, ...]
-    orient: bool = True
+    names: tuple[str, ...]  # relative POSIX paths in natural order (image2 before image10)
+    orient: bool = True  # see `mfvpr.datasets.image_reading.read_image`
     bits: int | None = 16
 
     def __post_init__(self) -> None:
@@ -95,17 +88,13 @@ class ImageFolder:
 class QuerySequence:
     """Query images of one drive or walk, with their ground truth; `name` stands in results.
 
-        sequence = mfvpr.datasets.QuerySequence("night", mfvpr.datasets.image_folder("night/"), truth=None)
-
-    Attributes:
-        truth: which database images are correct; None = no ground truth, rankings only.
-        excluded: the database images that are no candidates of each query; None = all images are candidates.
+    sequence = mfvpr.datasets.QuerySequence("night", mfvpr.datasets.image_folder("night/"), truth=None)
     """
 
     name: str
     images: ImageFolder
-    truth: Truth | None
-    excluded: Positives | None = None
+    truth: Truth | None  # which database images are correct; None = no ground truth, rankings only
+    excluded: Positives | None = None  # database images that are no candidates of each query; None = none
 
     def __repr__(self) -> str:
         truth = type(self.truth).__name__ if self.truth else "no ground truth"
@@ -114,9 +103,8 @@ class QuerySequence:
     def without_neighbors(self, num_database: int, query_rows: OwnRows, neighbors: int) -> "QuerySequence":
         """Exclude each query and its neighbors within `neighbors` frames from its candidates; 0 = the query alone.
 
-        Excluded images are not correct either: a query without other correct images counts as a failure. `query_rows`
-        are the rows of each query in the database, which is a sequence of `num_database` images; an `InputError` if no
-        query is among them.
+        Excluded images are not correct either. `query_rows` are the rows of each query in the database, a sequence of
+        `num_database` images; an `InputError` if no query is among them.
         """
         if not any(query_rows):
             raise InputError(
@@ -177,14 +165,9 @@ class Dataset:
 def image_folder(root: Path | str, *, orient: bool = True, bits: int | None = 16) -> ImageFolder:
     """All images below `root`, in subfolders and linked folders as well; hidden files and folders are skipped.
 
-        images = mfvpr.datasets.image_folder("day/")
+        mfvpr.datasets.image_folder("day/").read(0)  # [H, W, 3] uint8 RGB; for orient and bits see `read_image`
 
-    Args:
-        orient, bits: see `mfvpr.datasets.image_reading.read_image`.
-
-    Raises:
-        InputError: no such folder, a folder that cannot be listed, a broken link, a link to a parent folder, or no
-            images.
+    An `InputError` for a folder that is missing, empty or unreadable, a broken link, or a link to a parent folder.
     """
     root, names = Path(root), []
     if not root.is_dir():
@@ -227,8 +210,7 @@ def folder(
 ) -> Dataset:
     """Folders of images as a data set: one of database images, and one or several of queries.
 
-        data = mfvpr.datasets.folder("day/", "night/", ground_truth="order")
-        data = mfvpr.datasets.folder("day/", ["night/", "snow/"], ground_truth=mfvpr.datasets.IndexFile("pairs.csv"))
+        data = mfvpr.datasets.folder("day/", ["night/", "snow/"], ground_truth="order")
 
     Args:
         database: folder of database images.
@@ -238,9 +220,6 @@ def folder(
             "none" or None = rankings only; or files; or a ground truth of your own.
         name: in results.
         orient, bits: see `mfvpr.datasets.image_reading.read_image`.
-
-    Raises:
-        InputError: a folder or a file that cannot be used, no sequence, or a name that sequences cannot have.
     """
     images = image_folder(database, orient=orient, bits=bits)
     if isinstance(queries, Path | str):

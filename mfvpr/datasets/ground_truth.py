@@ -1,7 +1,6 @@
 """Ground truth: positives at a threshold; by file order, UTM coordinates in names, or from files as data.
 
-There are three units. Frames of the database sequence and meters have a threshold up to which database images count as
-correct. Exact ground truth has none.
+There are three units. Frames of the database sequence and meters have a threshold, exact ground truth has none.
 """
 
 import csv
@@ -19,9 +18,8 @@ from typing import Any, ClassVar, Literal
 import numpy as np
 from jaxtyping import Float, Float64, Int, Num
 
-from mfvpr.datasets.positives import Positives, rows_within
-from mfvpr.io.containers import parse_number, read_npz, reading, shorten
-from mfvpr.io.names import require_all
+from mfvpr.datasets.positives import Positives, positives_within
+from mfvpr.io.containers import parse_number, read_npz, reading, require_all, shorten
 from mfvpr.utils.errors import InputError
 
 Unit = Literal["frames", "m", "exact"]
@@ -91,7 +89,7 @@ class FrameTruth(Truth):
     Attributes:
         rows: per query; empty = unknown place, which counts as a failure.
         num_database: N.
-        widened: False = neighbors do not count, at any tolerance.
+        widened: False = neighbors do not count, at any tolerance, and the unit is "exact".
         starts: database rows at which a new drive begins, ascending; neighbors are of the same drive.
     """
 
@@ -102,11 +100,9 @@ class FrameTruth(Truth):
 
     @property
     def unit(self) -> Unit:
-        """Frames if neighbors count, otherwise exact."""
         return "frames" if self.widened else "exact"
 
     def positives(self, threshold: float) -> Positives:
-        """Correct database images at a tolerance in frames, inclusive."""
         tolerance = int(min(threshold, self.num_database)) if self.widened else 0
         near = {}  # rows within the tolerance of a row, in its drive
         for row in {*chain(*self.rows)}:
@@ -115,7 +111,6 @@ class FrameTruth(Truth):
         return Positives.from_rows(([*chain(*(near[row] for row in rows))] for rows in self.rows), self.num_database)
 
     def distance(self, query: int) -> Float[np.ndarray, " database"]:
-        """Frames to the nearest of the query's rows."""
         distance = np.full(self.num_database, np.inf)
         for row in self.rows[query]:
             drive = slice(*self._drive(row))
@@ -143,11 +138,9 @@ class RadiusTruth(Truth):
     database_xy: Num[np.ndarray, "database 2"]
 
     def positives(self, threshold: float) -> Positives:
-        """Correct database images at a radius in meters, inclusive."""
-        return Positives.from_rows(rows_within(self.query_xy, self.database_xy, threshold), len(self.database_xy))
+        return positives_within(self.query_xy, self.database_xy, threshold)
 
     def distance(self, query: int) -> Float[np.ndarray, " database"]:
-        """Meters to the query."""
         return np.linalg.norm(self.database_xy - self.query_xy[query], axis=1)
 
 
@@ -165,14 +158,10 @@ class LabelTruth(Truth):
     database_labels: Int[np.ndarray, " database"]
 
     def positives(self, threshold: float = 0) -> Positives:
-        """Database images with the query's label, at any threshold."""
-        labels, order = self.database_labels, np.argsort(self.database_labels, kind="stable").astype(np.int32)
-        first = np.searchsorted(labels, self.query_labels, "left", sorter=order)
-        last = np.where(self.query_labels < 0, first, np.searchsorted(labels, self.query_labels, "right", sorter=order))
-        return Positives.from_rows((order[run] for run in map(slice, first, last)), len(order))
+        rows = (np.flatnonzero(self.distance(query) == 0) for query in range(len(self.query_labels)))
+        return Positives.from_rows(rows, len(self.database_labels))
 
     def distance(self, query: int) -> Float[np.ndarray, " database"]:
-        """0 if correct, else infinite."""
         label = self.query_labels[query]
         return np.where((self.database_labels == label) & (label >= 0), 0.0, np.inf)
 
@@ -190,19 +179,15 @@ class AllowedTruth(Truth):
 
     @property
     def unit(self) -> Unit:
-        """Unit of the ground truth of all images."""
         return self.truth.unit
 
     def positives(self, threshold: float) -> Positives:
-        """Correct images that are not excluded."""
         return self.truth.positives(threshold) - self.excluded
 
     def shows_place(self, threshold: float) -> Positives:
-        """Images of the query's place: correct images and excluded ones (the query itself and its neighbors)."""
         return self.truth.shows_place(threshold) | self.excluded
 
     def distance(self, query: int) -> Float[np.ndarray, " database"]:
-        """Distance, infinite for excluded images."""
         distance = np.array(self.truth.distance(query), np.float64)
         distance[self.excluded.of(query)] = np.inf
         return distance
@@ -238,8 +223,7 @@ def truth_from_labels(
 ) -> LabelTruth:
     """Ground truth by equal labels, from a csv with the columns `name,label` for each side, one line per image.
 
-    An image with an empty label is never correct, and a query with one has no correct image. Labels are compared as
-    text, without spaces around them.
+    Labels are compared as text, without spaces around them. No image is correct for or with an empty label.
     """
     sides = []
     for path, names in ((Path(query_file), query_names), (Path(database_file), database_names)):
@@ -263,8 +247,7 @@ def truth_from_file(
     """Ground truth from an index file.
 
     * `.csv`: a header with the columns `query` and `database` (or SSM-VPR's `Live` and `Reference`), then one line per
-      pair: file names, or numbers from 0 in file order. A query may have several lines; an empty database cell means
-      that its place is not in the database.
+      pair: file names, or numbers from 0 in file order. An empty database cell means that the place is unknown.
     * `.npz`: arrays `query` and `database`, the same pairs; or Patch-NetVLAD's `utmQ` and `utmDb`.
     * `.json`: VPR-Bench's `[[query, [database, ...]], ...]`.
 
@@ -282,9 +265,8 @@ def truth_from_file(
         elif path.suffix.lower() == ".npz":
             arrays = read_npz(path, ("utmQ", "utmDb", "query", "database"))
             if {"utmQ", "utmDb"} <= arrays.keys():
-                for name, names in (("utmQ", query_names), ("utmDb", database_names)):
-                    require_positions(name, arrays[name], len(names))
-                return RadiusTruth(arrays["utmQ"].astype(np.float64), arrays["utmDb"].astype(np.float64))
+                sides = ("utmQ", query_names), ("utmDb", database_names)
+                return RadiusTruth(*(require_positions(name, arrays[name], len(names)) for name, names in sides))
             if not {"query", "database"} <= arrays.keys():
                 raise InputError("expected arrays query and database, or utmQ and utmDb, got neither")
             content = list(zip(arrays["query"].tolist(), arrays["database"].tolist(), strict=True))

@@ -35,7 +35,6 @@ _ORIENTATION = 0x0112
 _TURNS = "FLIP_LEFT_RIGHT ROTATE_180 FLIP_TOP_BOTTOM TRANSPOSE ROTATE_270 TRANSVERSE ROTATE_90"
 _TURN = {orientation: Image.Transpose[name] for orientation, name in enumerate(_TURNS.split(), start=2)}
 _INVERSE = {6: 8, 8: 6}  # all others are their own inverse
-_MAY_BE_TURNED = (b"eXIf", b"Raw profile type exif", b"XML:com.adobe.xmp")  # of a PNG file
 
 # Pillow warns from 89 megapixels on; `read_image` refuses earlier, with the file's name.
 warnings.filterwarnings("ignore", category=Image.DecompressionBombWarning)
@@ -49,15 +48,13 @@ def read_image(path: Path | str, *, orient: bool = True, bits: int | None = 16) 
 
     Args:
         orient: turn the image by its EXIF orientation.
-        bits: number of bits in use in 16-bit gray and color files (12-bit cameras write 16 bits as well). The upper 8
-            of them are kept: 2^bits - 1 becomes 255, 256 v and 257 v become v. It is the same for all images, so that
-            their brightness stays comparable. Netpbm files state their largest value, which is used instead. None =
-            Pillow's conversion: gray is cut off at 255, of color the upper 8 of 16 bits are kept.
+        bits: number of bits in use in 16-bit gray and color files (12-bit cameras write 16 bits as well), of which the
+            upper 8 are kept; Netpbm files state their largest value, which is used instead. None = Pillow's
+            conversion: gray is cut off at 255, of color the upper 8 of 16 bits are kept.
 
     Raises:
-        InputError: not an image file of a format in `FORMATS`, truncated, over 64 megapixels (checked before decoding),
-            or of 32 bits a channel, whose range is unknown (unless `bits` is None). Every damage to a PNG file is
-            noticed by its checksums; other formats have none, so that a flipped bit may change pixels.
+        InputError: not an image file of a format in `FORMATS`, damaged (only PNG has checksums), over 64 megapixels
+            (checked before decoding), or of 32 bits a channel, whose range is unknown (unless `bits` is None).
     """
     path = Path(path)
     with reading(path, "an image file", "replace or remove it"), open_image(path) as image:
@@ -102,8 +99,6 @@ def open_image(file: Path | str | BinaryIO) -> ImageFile.ImageFile:
 def shape_size(shape: tuple[int, int], pixels: float, multiple: int = 1) -> tuple[int, int]:
     """(width, height) px of about `pixels` in all, in the shape of an image of `shape` (width, height).
 
-        shape_size((1920, 1080), 100_000)  # (421, 237)
-
     Both sides are a `multiple`: the shorter one is rounded, then the longer one in its proportion.
     """
     short, long = sorted(shape)
@@ -112,38 +107,17 @@ def shape_size(shape: tuple[int, int], pixels: float, multiple: int = 1) -> tupl
     return (other, rounded) if shape[0] > shape[1] else (rounded, other)
 
 
-def gray(image: UInt8[np.ndarray, "height width 3"]) -> UInt8[np.ndarray, "height width"]:
-    """Brightness of an image, 0 to 255."""
-    return cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)
-
-
-def write_image(path: Path | str, image: UInt8[np.ndarray, "height width 3"]) -> None:
-    """Write an image (RGB) in the format of the path's suffix."""
-    Image.fromarray(image).save(path)
-
-
-def read_header(content: bytes) -> tuple[int, int | None]:
-    """Orientation and range of an image file's `content`.
-
-    Returns:
-        orientation: EXIF's, 1 .. 8; 1 = as stored, or a file that cannot be read.
-        largest: largest value of an image of 16 bits a channel; 0 if the file states its range, or has
-            32 bits; None = an image of 8 bits, or a file that cannot be read.
-    """
+def largest_16bit(content: bytes) -> int:
+    """Largest value of an image file of 16 bits a channel; 0 for others, and for files that state their range."""
     try:
         with open_image(BytesIO(content)) as image:
-            used = _bits_in_use(image, 16) if image.width * image.height <= MAX_PIXELS else None
-            may_be_turned = image.format != "PNG" or any(mark in content for mark in _MAY_BE_TURNED)
-            orientation = _orientation(image) if may_be_turned else 1  # of a PNG file, `_orientation` decodes all
-            if used is None:  # the range of 32 bits is unknown
-                return orientation, 0 if image.mode in ("I", "F") and image.format != "PPM" else None
-            if used != 16 or image.format == "PPM":  # the file states its range
-                return orientation, 0
+            states_range = image.format == "PPM" or image.width * image.height > MAX_PIXELS
+            if states_range or _bits_in_use(image, 16) != 16:
+                return 0
             is_gray = image.mode in _GRAY
-            values = np.asarray(image) if is_gray else _color_values(np.frombuffer(content, np.uint8))
-            return orientation, int(values.max())
+            return int((np.asarray(image) if is_gray else _color_values(np.frombuffer(content, np.uint8))).max())
     except Exception:  # decoders share no class of errors, and reading the image raises an InputError
-        return 1, None
+        return 0
 
 
 def resize(

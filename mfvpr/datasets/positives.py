@@ -1,6 +1,6 @@
 """Correct database images of each query, as rows per query, in NumPy on the host."""
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -10,25 +10,25 @@ from jaxtyping import Bool, Int, Integer, Num
 
 from mfvpr.utils.errors import InputError
 
-_QUERIES_AT_A_TIME = 128  # of a search by radius, which returns Python lists
-
 
 @dataclass(frozen=True, eq=False)
 class Positives:
     """Ragged lists of database rows, one per query; memory grows with the number of rows, not with Q x N.
 
-        positives = mfvpr.datasets.Positives.from_rows([[0, 1], [], [2]], num_database=4)  # or from_matrix
+        positives = mfvpr.datasets.Positives.from_rows([[0, 1], [], [2]], num_database=4)
         positives.of(0)  # [0, 1]
 
     `first | second` and `first - second` go query by query.
 
     Attributes:
-        matrix: sparse, `[Q, N]` bool, in SciPy's canonical form.
+        matrix: `[Q, N]` bool, given dense or sparse; kept sparse, in SciPy's canonical form.
     """
 
     matrix: "scipy.sparse.csr_array"
 
     def __post_init__(self) -> None:
+        if self.matrix.ndim != 2:
+            raise InputError(f"positives: expected a matrix [queries, database], got shape {self.matrix.shape}")
         matrix = scipy.sparse.csr_array(self.matrix, dtype=bool)
         if not matrix.has_canonical_format or not matrix.data.all():
             matrix = matrix.copy()  # of the caller, perhaps
@@ -42,19 +42,11 @@ class Positives:
         per_query = [np.asarray(query_rows) for query_rows in rows]
         flat = np.concatenate([query_rows for query_rows in per_query if len(query_rows)] or [np.zeros(0, np.int32)])
         if flat.dtype.kind not in "iu" or (flat.size and not 0 <= flat.min() <= flat.max() < num_database):
-            got = f"{flat.dtype} from {flat.min()} to {flat.max()}; from_matrix takes matrices"
+            got = f"{flat.dtype} from {flat.min()} to {flat.max()}; Positives(...) takes matrices"
             raise InputError(f"positives: expected rows of a database of {num_database} images, got {got}")
         offsets = np.cumsum([0, *map(len, per_query)], dtype=np.int32 if len(flat) < 2**31 else np.int64)
         content = np.ones(len(flat), bool), flat.astype(np.int32, copy=False), offsets
         return cls(scipy.sparse.csr_array(content, shape=(len(per_query), num_database)))
-
-    @classmethod
-    def from_matrix(cls, matrix: Any) -> "Positives":
-        """Create from a matrix `[Q, N]` bool; another shape raises an `InputError`."""
-        matrix = np.asarray(matrix, bool)
-        if matrix.ndim != 2:
-            raise InputError(f"positives: expected a matrix [queries, database], got shape {matrix.shape}")
-        return cls(scipy.sparse.csr_array(matrix))
 
     @property
     def recipe(self) -> dict[str, Any]:
@@ -96,13 +88,9 @@ class Positives:
         return Positives(self.matrix[np.arange(len(self))[queries]])
 
     def contains(self, rows: Any) -> Bool[np.ndarray, "*batch queries k"]:
-        """Whether rankings are correct: for each row, whether it is among the query's rows; -1 never is.
+        """Whether rankings are correct: whether each of `rows` `[..., Q, k]` is among the query's rows; -1 never is.
 
-        Args:
-            rows: `[..., Q, k]` of each query; leading axes hold several rankings.
-
-        Raises:
-            InputError: another number of queries, or rows beyond the database.
+        An `InputError` for another number of queries, or rows beyond the database.
         """
         rows = np.asarray(rows)
         is_valid = rows.ndim >= 2 and rows.shape[-2] == len(self)
@@ -137,14 +125,15 @@ def stack_positives(parts: Sequence[Positives]) -> Positives:
     return Positives(scipy.sparse.vstack([part.matrix for part in parts], format="csr"))
 
 
-def rows_within(query_xy: np.ndarray, database_xy: np.ndarray, radius: float) -> Iterator[np.ndarray]:
-    """Database rows int32 at most `radius` meters away from each query; coordinates as in `radius_positives`."""
-    query_xy, database_xy = np.asarray(query_xy, np.float64), np.asarray(database_xy, np.float64)
-    tree = scipy.spatial.KDTree(database_xy.reshape(-1, 2))
-    for first in range(0, len(query_xy), _QUERIES_AT_A_TIME):
-        block = query_xy[first : first + _QUERIES_AT_A_TIME]
-        for rows in tree.query_ball_point(block, radius, return_sorted=True):
-            yield np.array(rows, np.int32)
+def positives_within(query_xy: np.ndarray, database_xy: np.ndarray, radius: float) -> Positives:
+    """Database images at most `radius` meters away from each query; coordinates as in `radius_positives`."""
+    for xy in (query_xy, database_xy):
+        if np.size(xy) and np.shape(xy)[1:] != (2,):
+            raise InputError(f"positions: expected (x, y) [images, 2] in meters, got shape {np.shape(xy)}")
+    queries, database = (scipy.spatial.KDTree(np.reshape(xy, (-1, 2))) for xy in (query_xy, database_xy))
+    pairs = queries.sparse_distance_matrix(database, radius, output_type="ndarray")
+    content = np.ones(len(pairs), bool), (pairs["i"], pairs["j"])
+    return Positives(scipy.sparse.csr_array(content, shape=(queries.n, database.n)))
 
 
 def frame_positives(
@@ -175,4 +164,4 @@ def radius_positives(
         query_xy, database_xy = np.array([[0.0, 1.0]]), np.array([[0.0, 0.0], [0.0, 40.0]])
         mfvpr.radius_positives(query_xy, database_xy, radius=25.0)  # [[True, False]]
     """
-    return Positives.from_rows(rows_within(query_xy, database_xy, radius), len(database_xy)).dense()
+    return positives_within(query_xy, database_xy, radius).dense()

@@ -9,12 +9,13 @@ from itertools import product, zip_longest
 from pathlib import Path, PurePosixPath
 
 import numpy as np
+import scipy  # its subpackages are imported at their first use
 
 from mfvpr.datasets.datasets import Dataset, ImageFolder, QuerySequence, image_folder
 from mfvpr.datasets.ground_truth import FARTHEST, FrameTruth, RadiusTruth, Truth, require_positions, truth_from_file
-from mfvpr.datasets.positives import rows_within
+from mfvpr.datasets.positives import positives_within
 from mfvpr.io.containers import parse_number, reading, shorten
-from mfvpr.io.object_files import read_matlab, read_objects
+from mfvpr.io.object_files import read_objects
 from mfvpr.utils.errors import InputError
 
 SEASONS = ("fall", "spring", "summer", "winter")
@@ -63,8 +64,6 @@ class Published:
 
 def published_dataset(name: str, root: Path | str, *, seasons: tuple[str, str] | None = None) -> Dataset:
     """The data set `name` of `PUBLISHED`, from its folder `root`; `seasons` of Nordland are (database, queries).
-
-        data = published_dataset("gardens_point", "DIR")  # DIR has Reference/, Live/ and GroundTruth.csv
 
     An `InputError` says which files and images are missing, damaged, or of another layout.
     """
@@ -118,7 +117,8 @@ def nordland_27592(root: Path, seasons: tuple[str, str]) -> Content:
     for season, side in zip(seasons, ("index", "query"), strict=True):
         listed = root / f"nordland_imageNames_{side}.txt"
         if listed.exists():  # its names begin with other folders
-            names = [PurePosixPath(line).name for line in _lines(listed)]
+            with reading(listed, "a list"):
+                names = [PurePosixPath(line).name for line in np.loadtxt(listed, str, ndmin=1).tolist()]
             folders.append(listed_images(root / season, names, listed))
         else:
             folders.append(image_folder(root / season))
@@ -160,11 +160,11 @@ def robotcar_seasons(root: Path) -> Dataset:
     """
     path = root / "robotcar_v2_train.txt"
     with reading(path, "a list", "expected lines of a name and the 16 numbers of a pose by rows, the last 0 0 0 1"):
-        lines = [line.split() for line in _lines(path)]
-        poses = np.array([words[1:] for words in lines], np.float64).reshape(len(lines), 4, 4)
+        lines = np.loadtxt(path, str, ndmin=2)
+        poses = lines[:, 1:].astype(np.float64).reshape(len(lines), 4, 4)
         if not np.allclose(poses[:, 3], (0, 0, 0, 1), rtol=0, atol=1e-6) or not (np.abs(poses) <= FARTHEST).all():
             raise ValueError("numbers that are no pose")
-    images = (PurePosixPath(words[0]).with_suffix(".jpg").as_posix() for words in lines)
+    images = (PurePosixPath(name).with_suffix(".jpg").as_posix() for name in lines[:, 0].tolist())
     centers: dict[str, np.ndarray] = {}
     for image, center in zip(images, poses[:, :3, 3], strict=True):
         if not np.array_equal(centers.setdefault(image, center), center):
@@ -200,12 +200,11 @@ def pitts30k(root: Path, name: str) -> Content:
             raise InputError(f"{root}: expected datasets/{name}.mat, or {lists}; get the whole data set")
         return content_of_lists(root, root / f"{name}_dbImages.npy", root / f"{name}_qImages.npy", truths[0])
     names, positions = [], []
-    with reading(structures[0], mend=f"expected the structure dbStruct of {name}"), structures[0].open("rb") as file:
-        arrays = read_matlab(file, text=True)
+    with reading(structures[0], mend=f"expected the structure dbStruct of {name}"):
+        structure = scipy.io.loadmat(structures[0])["dbStruct"][0, 0]
         for images, xy in (("dbImageFns", "utmDb"), ("qImageFns", "utmQ")):
-            names.append([str(text) for path, text in arrays.items() if path.startswith(f"dbStruct.{images}.")])
-            positions.append(arrays[f"dbStruct.{xy}"].T.astype(np.float64))
-            require_positions(xy, positions[-1], len(names[-1]))
+            names.append([str(cell.item()) for cell in structure[images].ravel()])
+            positions.append(require_positions(xy, structure[xy].T, len(names[-1])))
     database = listed_images(root, names[0], structures[0])
     queries = listed_images(root, [f"queries_real/{query}" for query in names[1]], structures[0])
     return database, queries, RadiusTruth(positions[1], positions[0])
@@ -219,7 +218,7 @@ def msls_val(root: Path) -> Content:
     lists = [root / f"msls_val_{part}.npy" for part in ("dbImages", "qImages", "pIdx", "qIdx")]
     if any(path.exists() for path in lists):
         return content_of_lists(root, *lists)
-    flags = {"true": True, "1": True, "false": False, "0": False}  # as pandas reads them
+    flags = {"True": True, "False": False}
     names, positions = {"database": [], "query": []}, {"database": [], "query": []}
     for side, city in product(names, CITIES):
         folder, tables = root / "train_val" / city / side, []
@@ -234,14 +233,14 @@ def msls_val(root: Path) -> Content:
         with reading(folder / "postprocessed.csv", mend=mend):
             processed, raw, tasks = tables
             for key, line in processed.items():
-                if flags[tasks[key]["all"].lower()] and not flags[raw[key]["pano"].lower()]:
+                if flags[tasks[key]["all"]] and not flags[raw[key]["pano"]]:
                     names[side].append(f"train_val/{city}/{side}/images/{key}.jpg")
                     positions[side].append([parse_number(line["easting"]), parse_number(line["northing"])])
-    places = {side: np.array(xy, np.float64).reshape(-1, 2) for side, xy in positions.items()}
-    for side, xy in places.items():
-        require_positions(f"{root}: {side}", xy, len(names[side]))
-    near = rows_within(places["query"], places["database"], 25.0)
-    rows = [row for row, database_rows in enumerate(near) if len(database_rows)]
+    places = {
+        side: require_positions(f"{root}: {side}", np.reshape(xy, (-1, 2)), len(names[side]))
+        for side, xy in positions.items()
+    }
+    rows = np.flatnonzero(positives_within(places["query"], places["database"], 25.0).counts)
     database = listed_images(root, names["database"], root / "train_val")
     queries = listed_images(root, [names["query"][row] for row in rows], root / "train_val")
     return database, queries, RadiusTruth(places["query"][rows], places["database"])
@@ -277,11 +276,11 @@ def listed_images(root: Path, names: Sequence[str], origin: Path) -> ImageFolder
 
 def read_names(path: Path) -> list[str]:
     """Read names from an `.npy` file of text."""
-    with reading(path, "a list", "expected an array of NumPy"), path.open("rb") as file:
-        names = np.lib.format.read_array(file, allow_pickle=False)
-    if names.ndim != 1 or names.dtype.kind != "U":
-        raise InputError(f"{path}: expected a list of names, got {names.dtype} {list(names.shape)}")
-    return names.tolist()
+    with reading(path, "a list", "expected an array of NumPy"):
+        names = np.load(path, allow_pickle=False)
+        if names.ndim != 1 or names.dtype.kind != "U":
+            raise InputError(f"expected a list of names, got {names.dtype} {list(names.shape)}")
+        return names.tolist()
 
 
 def read_rows(path: Path, num_database: int) -> list[tuple[int, ...]]:
@@ -298,13 +297,6 @@ def read_rows(path: Path, num_database: int) -> list[tuple[int, ...]]:
         if len({*rows.tolist()}) < rows.size:  # such as flags, of which most are equal
             raise InputError(f"{path}: query {query}: expected every row once, got {shorten(str(rows))}")
     return [tuple(rows.tolist()) for rows in per_query]
-
-
-def _lines(path: Path) -> list[str]:
-    """Lines that are not empty, without the spaces around them."""
-    with reading(path, "a list"):
-        text = path.read_text(encoding="utf-8-sig", errors="surrogateescape")
-    return [stripped for line in text.splitlines() if (stripped := line.strip())]
 
 
 _SSM_VPR, _SEASONS = "http://imr.ciirc.cvut.cz/Datasets/Ssm-vpr", ("summer", "winter")

@@ -10,15 +10,17 @@ import tempfile
 from dataclasses import replace
 from pathlib import Path
 
+import cv2
 import numpy as np
 from jaxtyping import Float, UInt8
+from PIL import Image
 
 from mfvpr.core.batch import score_candidates
 from mfvpr.core.histogram import HistogramOfShifts
 from mfvpr.core.types import Matches
 from mfvpr.core.weights import RatioWeight
 from mfvpr.datasets.datasets import ImageFolder, QuerySequence, image_folder
-from mfvpr.datasets.image_reading import gray, resize, write_image
+from mfvpr.datasets.image_reading import resize
 from mfvpr.evaluation import stages
 from mfvpr.evaluation.dataset_ranking import RankedDataset, Reason, match_sequence
 from mfvpr.evaluation.rankings import Matched
@@ -42,7 +44,7 @@ _SCORER = HistogramOfShifts(weight=RatioWeight())
 
 def reason_against_image(pixels: UInt8[np.ndarray, "height width 3"]) -> Reason | None:
     """Why a query, at the size of the extractor, cannot be used; None = it may be."""
-    brightness = gray(pixels)
+    brightness = cv2.cvtColor(pixels, cv2.COLOR_RGB2GRAY)
     if np.mean(brightness >= 250) > _MOST_WHITE:
         return "overexposed"
     brightness = brightness.astype(np.float32)
@@ -124,7 +126,7 @@ def _noise_score(ranked: RankedDataset, cache: FeatureCache) -> float:
         return float("nan")
     with tempfile.TemporaryDirectory() as folder:
         for number, image in enumerate(noise_images(pipeline.extractor.image_size)):
-            write_image(Path(folder) / f"{number}.png", image)
+            Image.fromarray(image).save(Path(folder) / f"{number}.png")
         sequence = QuerySequence("noise", image_folder(folder), None)
         dataset = replace(ranked.dataset, sequences=(sequence,))
         matched = match_sequence(dataset, sequence, pipeline, cache=cache)

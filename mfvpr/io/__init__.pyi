@@ -8,7 +8,6 @@ __all__ = [
     "read_poses",
     "read_shortlist",
     "read_stamps",
-    "reranked_shortlist",
     "stamps_in_names",
     "write_features",
     "write_global_descriptors",
@@ -24,5 +23,5 @@ from .features import (
     write_global_descriptors,
 )
 from .matches import Images, ImportedMatches, open_matches
-from .shortlists import read_shortlist, reranked_shortlist, write_shortlist
+from .shortlists import read_shortlist, write_shortlist
 from .trajectories import read_poses, read_stamps, stamps_in_names, write_trajectory

@@ -1,9 +1,5 @@
 """Read features and global descriptors that other programs extracted, and write them for other programs.
 
-    features = open_features(Path("feats-d2net-ss.h5"), dataset.database.names)
-    for row, image_features in features.read([3, 14]):
-        ...
-
 Parts of an image in a file:
 
 - `keypoints` `[N, 2]` (x, y), px, pixel centers at whole numbers; up to two more columns (scale, angle) are ignored;
@@ -12,7 +8,7 @@ Parts of an image in a file:
 - `image_size` `[2]` (width, height), px, of the image that the keypoints are in.
 """
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
 from typing import Any, Literal
@@ -27,13 +23,16 @@ from mfvpr.io.containers import (
     NpzFiles,
     as_float32,
     choose_reader,
+    match_names,
+    match_paths,
     read_npz,
     reading,
+    require_all,
+    require_different,
     shorten,
     write_h5,
     write_npz,
 )
-from mfvpr.io.names import match_names, match_paths, require_all, require_different
 from mfvpr.utils.errors import InputError, require_word
 from mfvpr.utils.files import printable, replacing, require_replaceable
 
@@ -47,17 +46,11 @@ PARTS = ("keypoints", "descriptors", *SCORES, "image_size")
 
 @dataclass(frozen=True, eq=False)
 class ImportedFeatures:
-    """Features of M images in files of another program, made by `open_features`.
+    """Features of M images in files of another program, made by `open_features`."""
 
-    Attributes:
-        path: file or folder.
-        counts: keypoints of each image, -1 = missing image.
-        dimension: D; 0 if no image has a keypoint.
-    """
-
-    path: Path
-    counts: Int32[np.ndarray, " images"]
-    dimension: int
+    path: Path  # file or folder
+    counts: Int32[np.ndarray, " images"]  # keypoints of each image, -1 = missing image
+    dimension: int  # D; 0 if no image has a keypoint
     _container: H5File | NpzFiles
     _images: Sequence[str | None]
     _transposed: bool
@@ -73,13 +66,9 @@ class ImportedFeatures:
         return [None if image is None else self._container.entries[image] for image in self._images]
 
     def read(self, rows: Iterable[int] | None = None) -> Iterator[tuple[int, Features]]:
-        """Read the row and features of each image: unpadded NumPy float32 with a full mask.
+        """Read the row and features of images in the order of `rows`: unpadded NumPy float32 with a full mask.
 
-        Args:
-            rows: rows of images, in the order to read them; None = all images in the files.
-
-        Raises:
-            InputError: an image is missing, or its arrays are damaged or do not fit each other.
+        None = all images in the files. An `InputError` for an image that is missing, or whose arrays are damaged.
         """
         rows = np.flatnonzero(self.counts >= 0).tolist() if rows is None else [int(row) for row in rows]
         images = {row: image for row in rows if 0 <= row < len(self) and (image := self._images[row]) is not None}
@@ -128,8 +117,7 @@ def open_features(
     Args:
         path: `.h5` or `.hdf5` of hloc; `.npz` of all images, with arrays named `image/part`; or a folder with a `.npz`
             or a `.d2-net` (of D2-Net's code) for each image.
-        names: `[M]` relative POSIX paths, as `ImageFolder.names`; see `names.match_names`. Use hloc's paths if they
-            begin at a parent folder (`database/1.jpg`).
+        names: `[M]` relative POSIX paths, matched as in `containers.match_names`.
         paths: `[M]` full paths of the images, which are tried before the names; () = none.
         image_size: `[2]` or `[M, 2]` (width, height), px, if the files have no `image_size`.
         lengths: of descriptors. `unit`: require unit length within 1 %, and correct rounding; `normalize`: scale to
@@ -137,8 +125,7 @@ def open_features(
         partial: whether images may be missing (their count is -1).
 
     Raises:
-        InputError: the file is missing, damaged or has another format; images are missing or ambiguous; arrays do not
-            fit each other.
+        InputError: a damaged file, another format, missing or ambiguous images, or arrays that do not fit each other.
     """
     path, sizes = Path(path), None
     require_word("lengths", lengths, Lengths)
@@ -182,9 +169,7 @@ def open_features(
 def write_features(
     path: Path | str, names: Sequence[str], rows: Iterable[tuple[int, Features]], *, half: bool = False
 ) -> None:
-    """Write features without padding, one image after the other; `open_features` reads them back.
-
-    Each file is written completely or not at all.
+    """Write features without padding, as `open_features` reads them; each file completely or not at all.
 
     Args:
         path: `.h5` or `.hdf5`: as hloc, descriptors `[D, N]`; `.npz`: one file with arrays named `image/part`,
@@ -194,8 +179,7 @@ def write_features(
         half: float16 instead of float32, as hloc by default. Positions lose up to 0.5 px beyond 1024 px.
 
     Raises:
-        InputError: a file exists, a value is too large for float16, a name is no path below a folder, or two images
-            share a name.
+        InputError: a file exists, a value is too large for float16, or a name is used twice or is no path in a folder.
     """
     path = Path(path)
     require_different(path, names)
@@ -232,32 +216,26 @@ def require_inside(where: str, keypoints: np.ndarray, size: np.ndarray) -> None:
 
 
 def read_global_descriptors(
-    path: Path | str, names: Sequence[str], *, lengths: Lengths = "unit"
+    path: Path | str,
+    names: Sequence[str],
+    *,
+    lengths: Lengths = "unit",
+    check_entries: Callable[[list[FileEntry]], None] | None = None,
 ) -> Float32[np.ndarray, "images dimensions"]:
-    """Global descriptors of the images `names`.
+    """Global descriptors `[M, D]` of the images `names`, float32, in their order.
 
     Args:
         path: `.npy`: `[M, D]`, in the order of the names as Python sorts them (image10 before image2), such as
             VPR-methods-evaluation's `database_descriptors.npy`;
             `.npz`: `descriptors` `[M, D]` and `names` `[M]`; without `names`, the order of `.npy`;
             `.h5` or `.hdf5`: as hloc, a `global_descriptor` `[D]` for each image.
-        names: `[M]` relative POSIX paths, matched as in `names.match_names`.
+        names: `[M]` relative POSIX paths, matched as in `containers.match_names`.
         lengths: as in `open_features`.
-
-    Returns:
-        `[M, D]` float32 in the order of `names`.
+        check_entries: called with the place of each image's descriptor.
 
     Raises:
-        InputError: the file is missing or damaged; images are missing or ambiguous; values are not finite; or lengths
-            are not 1.
+        InputError: a damaged file, missing or ambiguous images, values that are not finite, or lengths that are not 1.
     """
-    return read_descriptors_with_entries(path, names, lengths=lengths)[0]
-
-
-def read_descriptors_with_entries(
-    path: Path | str, names: Sequence[str], *, lengths: Lengths = "unit"
-) -> tuple[Float32[np.ndarray, "images dimensions"], list[FileEntry]]:
-    """Descriptors as `read_global_descriptors` returns them, and `[M]` the entry of each image."""
     path = Path(path)
     require_word("lengths", lengths, Lengths)
     choose_reader(path, dict.fromkeys((".npy", ".npz", ".h5", ".hdf5"), Path))
@@ -290,20 +268,17 @@ def read_descriptors_with_entries(
             raise InputError(f"{path}: expected {GLOBAL} [D] of all images, with one D, got {sorted(shapes)}")
         values = np.stack(vectors) if vectors else np.zeros((0, 0), np.float32)
     _require_rows(path, values, names)
-    values = _scaled(str(path), as_float32(str(path), values), lengths)
-    return values, [FileEntry(path, entry) for entry in entries]
+    if check_entries is not None:
+        check_entries([FileEntry(path, entry) for entry in entries])
+    return _scaled(str(path), as_float32(str(path), values), lengths)
 
 
 def write_global_descriptors(
     path: Path | str, names: Sequence[str], descriptors: Float[Array, "images dimensions"], *, half: bool = False
 ) -> None:
-    """Write global descriptors `[M, D]` as `read_global_descriptors` reads them, atomically.
+    """Write global descriptors `[M, D]` in the order of `names` as `read_global_descriptors` reads them, atomically.
 
-    Args:
-        path: new file, `.npy`, `.npz`, `.h5` or `.hdf5`.
-        names: `[M]`.
-        descriptors: `[M, D]` in the order of `names`.
-        half: float16 instead of float32, as hloc by default.
+    `path` is a new file, `.npy`, `.npz`, `.h5` or `.hdf5`; `half` means float16, as hloc by default.
     """
     path = Path(path)
     require_different(path, names)

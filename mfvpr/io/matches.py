@@ -7,6 +7,7 @@ Matches are numbers of keypoints (hloc, kapture, COLMAP), or points (dense match
 """
 
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -14,9 +15,8 @@ import numpy as np
 from jaxtyping import Float32
 
 from mfvpr.core.types import Features, Matches, Shortlist
-from mfvpr.io.containers import FileEntry, as_float32, shorten
+from mfvpr.io.containers import FileEntry, as_float32, match_paths, require_one_image, shorten
 from mfvpr.io.features import ImportedFeatures, require_inside
-from mfvpr.io.names import match_paths, require_one_image
 from mfvpr.io.pair_files import Pair, PairFiles, Size, open_pairs
 from mfvpr.utils.errors import InputError
 
@@ -24,20 +24,13 @@ _ROUNDING = 1e-3  # by which a confidence may leave 0 to 1
 
 
 class Images(NamedTuple):
-    """Images of one side.
+    """Images of one side; their names are matched as in `containers.match_names`."""
 
-    names: relative POSIX paths, as `ImageFolder.names`, matched as in `names.match_names`.
-    paths: full paths, by which an image that is on both sides is known; () = unknown.
-    has_prefix: whether names have a prefix as in the file; without one, paths are tried before the names.
-    size: size of the image file of a row; None = unknown.
-    features: of these images, for files of matches without keypoints.
-    """
-
-    names: Sequence[str]
-    paths: Sequence[str] = ()
-    has_prefix: bool = False
-    size: Callable[[int], Size] | None = None
-    features: ImportedFeatures | None = None
+    names: Sequence[str]  # relative POSIX paths, as `ImageFolder.names`
+    paths: Sequence[str] = ()  # full paths, by which an image that is on both sides is known; () = unknown
+    has_prefix: bool = False  # whether names have a prefix as in the file; without one, paths are tried before names
+    size: Callable[[int], Size] | None = None  # of the image file of a row
+    features: ImportedFeatures | None = None  # for files of matches without keypoints
 
 
 class ImportedMatches:
@@ -76,8 +69,7 @@ class ImportedMatches:
     def read(self, query: int, candidates: Sequence[int]) -> list[Matches | None]:
         """Matches `[n]` of a query with each candidate, NumPy, without padding; None = the file lacks the pair.
 
-        Raises:
-            InputError: matches are damaged, beyond the keypoints or the images, or confidences beyond 0 to 1.
+        An `InputError` for damaged matches, or values beyond the keypoints, the images, or 0 to 1 for confidences.
         """
         pairs = {row: pair for row in candidates if (pair := self._pair(query, row)) is not None}
         contents = self._files.read([self._files.places[pair] for pair in pairs.values()])
@@ -170,8 +162,7 @@ def open_matches(
         confidences: whether matches have the confidences of the file; if not, or without any, all are 1.
 
     Raises:
-        InputError: the file is missing, damaged or has another format; names are ambiguous; there is no pair of a query
-            and a database image; or features are missing.
+        InputError: a damaged file, another format, ambiguous names, no pair of these images, or missing features.
     """
     files = open_pairs(Path(path), (queries.names, database.names), verified)
     features = [side.features for side in (queries, database) if side.features is not None]
@@ -220,26 +211,18 @@ def numbered_matches(
 
 def point_matches(where: str, first: Any, second: Any, confidence: Any, size0: Size, size1: Size) -> Matches:
     """Matches `[M]` from points `[M, 2]` (x, y) in images of these sizes, px; their distances are 0, their scores 1."""
-    points, sizes = [], [np.array(size, np.float32) for size in (size0, size1)]
-    for values, size in zip((first, second), sizes, strict=True):
-        values = as_float32(f"{where}: points", np.asarray(values), "fiu")
-        points.append(values if values.size else np.zeros((0, 2), np.float32))
-        if points[-1].shape[1:] != (2,) or len(points[-1]) != len(points[0]):
+    sides = []
+    for values, size in ((first, size0), (second, size1)):
+        points = as_float32(f"{where}: points", np.asarray(values), "fiu")
+        points, size = points if points.size else np.zeros((0, 2), np.float32), np.array(size, np.float32)
+        if points.shape[1:] != (2,) or (sides and len(points) != len(sides[0].mask)):
             got = f"{[*np.shape(first)]} and {[*np.shape(second)]}"
             raise InputError(f"{where}: expected as many points (x, y) [M, 2] in both images, got {got}")
-        require_inside(where, points[-1], size)
-    ones = np.ones(len(points[0]), np.float32)
-    return Matches(
-        points0=points[0],
-        points1=points[1],
-        distance=np.zeros_like(ones),
-        scores0=ones,
-        scores1=ones,
-        mask=ones > 0,
-        image_size0=sizes[0],
-        image_size1=sizes[1],
-        confidence=_confidences(where, confidence, len(ones)),
-    )
+        require_inside(where, points, size)
+        sides.append(Features.of(points, np.zeros((len(points), 0), np.float32), image_size=size))
+    numbers = np.arange(len(sides[0].mask))
+    matches = numbered_matches(where, numbers, numbers, confidence, *sides)
+    return replace(matches, index0=None, index1=None, count0=None, count1=None)
 
 
 def _confidences(where: str, confidence: Any, count: int) -> Float32[np.ndarray, " matches"]:

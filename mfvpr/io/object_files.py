@@ -57,23 +57,18 @@ class ArrayUnpickler(DataUnpickler):
     """Unpickler of NumPy's arrays among plain data; paths become text."""
 
     names: ClassVar = {
-        **dict.fromkeys(
-            ("numpy.core.multiarray._reconstruct", "numpy._core.multiarray._reconstruct"),
-            Function(lambda *_: np.ndarray(0, np.int8)),  # which the pickle fills
-        ),
-        "numpy.ndarray": Function(np.ndarray),
-        "numpy.dtype": Function(lambda code, *_: np.dtype(code, copy=True)),  # NumPy's own types stay as they are
-        "_codecs.encode": Function(lambda text, *_: text.encode("latin-1")),  # bytes in protocols that have none
-        "__builtin__.bytes": Function(bytes),  # of an array without values
-        "builtins.bytes": Function(bytes),
-        **dict.fromkeys(
-            ("pathlib.PosixPath", "pathlib._local.PosixPath"),
-            Function(lambda *parts: PurePosixPath(*parts).as_posix()),
-        ),
-        **dict.fromkeys(
-            ("pathlib.WindowsPath", "pathlib._local.WindowsPath"),
-            Function(lambda *parts: PureWindowsPath(*parts).as_posix()),
-        ),
+        f"{module}.{name}": Function(stand_in)
+        for modules, name, stand_in in (
+            # An empty array, which the pickle fills.
+            (("numpy.core.multiarray", "numpy._core.multiarray"), "_reconstruct", lambda *_: np.ndarray(0, np.int8)),
+            (("numpy",), "ndarray", np.ndarray),
+            (("numpy",), "dtype", lambda code, *_: np.dtype(code, copy=True)),  # NumPy's own types stay as they are
+            (("_codecs",), "encode", lambda text, *_: text.encode("latin-1")),  # bytes in protocols that have none
+            (("__builtin__", "builtins"), "bytes", bytes),  # of an array without values
+            (("pathlib", "pathlib._local"), "PosixPath", lambda *parts: PurePosixPath(*parts).as_posix()),
+            (("pathlib", "pathlib._local"), "WindowsPath", lambda *parts: PureWindowsPath(*parts).as_posix()),
+        )
+        for module in modules
     }
 
 
@@ -107,11 +102,10 @@ def open_torch_archive(file: BinaryIO) -> Iterator[tuple[zipfile.ZipFile, str, B
         yield archive, pickles[0].removesuffix("data.pkl"), io.BytesIO(archive.read(pickles[0]))
 
 
-def read_matlab(file: BinaryIO, *, text: bool = False) -> dict[str, np.ndarray]:
+def read_matlab(file: BinaryIO) -> dict[str, np.ndarray]:
     """Read arrays by path: `variable.field.0.field`, with 0, 1, ... for elements of a cell or an array of structures.
 
-    Reads versions 4 to 7.2. If `text`, lines of text are read as well, as arrays of one string. SciPy's errors are
-    raised if the file is damaged.
+    Reads versions 4 to 7.2. SciPy's errors are raised if the file is damaged.
     """
     arrays = {}
 
@@ -124,8 +118,6 @@ def read_matlab(file: BinaryIO, *, text: bool = False) -> dict[str, np.ndarray]:
         elif value.dtype == object:  # a cell
             for place, part in enumerate(value.ravel(order="F")):
                 collect(f"{path}.{place}", part)
-        elif value.dtype.kind == "U" and value.size == 1 and text:
-            arrays[path] = np.array(value.item())
         elif value.dtype.kind in "fiu" and value.size:
             arrays[path] = value
 

@@ -27,43 +27,28 @@ Pair = tuple[str, str]  # names of two images in a file
 
 
 class FileMatches(NamedTuple):
-    """Matches of one pair as a file has them.
-
-    first, second: `[M]` numbers of keypoints, or `[M, 2]` (x, y), px.
-    confidence: None = the file has none.
-    sizes: of the images that the points are in; None = the file does not tell.
-    """
+    """Matches of one pair as a file has them: numbers of keypoints `[M]`, or points `[M, 2]` (x, y), px."""
 
     first: Num[np.ndarray, "matches ..."]
     second: Num[np.ndarray, "matches ..."]
     confidence: Num[np.ndarray, " matches"] | None = None
-    sizes: tuple[Size, Size] | None = None
+    sizes: tuple[Size, Size] | None = None  # of the images that the points are in; None = the file does not tell
 
 
 @dataclass(frozen=True)
 class PairFiles:
-    """Matches of image pairs in a file or folder `path`; a pair of names has an order.
-
-    Attributes:
-        places: where the matches of each pair are; they may be none.
-        read: matches at some of the places, in their order.
-        by_number: whether matches are numbers of keypoints.
-        sided: whether the first name of a pair is always the query's, so that a name may also be a database image's.
-        in_image_files: whether points without sizes are in the px of the image files.
-        keypoints: keypoints (x, y) of an image, px, pixel centers at whole numbers (but see kapture); None = unknown.
-        image_size: size of an image; None = unknown.
-        spelling: of the name of an image in the file.
-    """
+    """Matches of image pairs in a file or folder `path`; a pair of names has an order."""
 
     path: Path
-    places: Mapping[Pair, Any]
-    read: Callable[[Sequence[Any]], Iterator[FileMatches]]
-    by_number: bool = True
-    sided: bool = False
-    in_image_files: bool = True
+    places: Mapping[Pair, Any]  # of the matches of each pair; they may be none
+    read: Callable[[Sequence[Any]], Iterator[FileMatches]]  # matches at some of the places, in their order
+    by_number: bool = True  # whether matches are numbers of keypoints
+    sided: bool = False  # whether the first name of a pair is always the query's, and may be a database image's as well
+    in_image_files: bool = True  # whether points without sizes are in the px of the image files
+    # Keypoints (x, y) of an image, px, pixel centers at whole numbers (but see kapture); None = unknown.
     keypoints: Callable[[str], Float[np.ndarray, "keypoints 2"]] | None = None
-    image_size: Callable[[str], Size] | None = None
-    spelling: Callable[[str], str] = str
+    image_size: Callable[[str], Size] | None = None  # of an image
+    spelling: Callable[[str], str] = str  # of the name of an image in the file
 
     @property
     def images(self) -> list[str]:
@@ -217,8 +202,8 @@ def kapture_folders(path: Path) -> tuple[Path, Path]:
 def open_kapture(path: Path) -> PairFiles:
     """kapture's `reconstruction/matches/TYPE` with `reconstruction/keypoints/TYPE`.
 
-    `path` is kapture's root, or a folder of matches if there are several types. Keypoints are taken as they are: their
-    pixel centers are at whole numbers from extractors such as R2D2, and at half pixels if kapture has them from COLMAP.
+    `path` is kapture's root, or a folder of matches if there are several types. Keypoints are taken as they are: pixel
+    centers are at whole numbers, or at half pixels from COLMAP.
     """
     matches, features = kapture_folders(path)
     layout = features / "keypoints.txt"  # the line `name, dtype, dsize`
@@ -253,16 +238,14 @@ QUERY, PREDICTIONS, POSITIVES = "Query path:", "Predictions paths:", "Positives 
 _NAMES = ("img0_path", "img1_path")  # vismatch's
 _LAYOUTS = (("points0", "points1", "confidence"), ("matched_kpts0", "matched_kpts1", "matched_confidences"))
 _INLIERS = ("inlier_kpts0", "inlier_kpts1", "")
-_NUMBERED = ("keypoints0", "keypoints1", "matches", "match_confidence")  # SuperGlue's
 _SIZES = ("image_size0", "image_size1", "im_size")  # the last: side of vismatch's square images
-_PARTS = {*_NAMES, *chain(*_LAYOUTS), *_INLIERS, *_NUMBERED, *_SIZES}
+_PARTS = {*_NAMES, *chain(*_LAYOUTS), *_INLIERS, *_SIZES}
 
 
 def open_results(path: Path, names: tuple[Sequence[str], Sequence[str]], verified: bool = False) -> PairFiles:
     """A folder of files of a pair, which have the `names` of the images in them or in their own names.
 
-    `SuperGlue` names a file `STEM_STEM_matches.npz`, with the query first. Such names have no folders, so that queries
-    and database images may have the same names: `sided`.
+    Names of files, `QUERY_DATABASE.npz`, have no folders, so that both sides may have the same names: `sided`.
     """
     stems = [{PurePosixPath(name).stem for name in side} for side in names]
     places: dict[Pair, Path] = {}
@@ -365,19 +348,5 @@ def _matches_of(file: Path, result: Mapping[str, Any], verified: bool) -> FileMa
     for first, second, confidence in (_INLIERS,) if verified else _LAYOUTS:
         if first in parts and second in parts:
             return FileMatches(parts[first], parts[second], parts.get(confidence), sizes)
-    if verified or not {*_NUMBERED[:3]} <= parts.keys():
-        expected = " and ".join(_INLIERS[:2]) if verified else "points0 and points1, or matched_kpts0 and matched_kpts1"
-        raise InputError(f"{file}: expected {expected}, got {shorten(', '.join(sorted(parts))) or 'none'}")
-    points0, points1, numbers = (parts[name] for name in _NUMBERED[:3])
-    confidence = parts.get(_NUMBERED[3], np.ones(numbers.shape))
-    is_fitting = points1.ndim == 2 and numbers.dtype.kind in "iu"
-    is_fitting &= points0.shape[:1] == numbers.shape == confidence.shape
-    if not is_fitting or (numbers < -1).any() or (numbers >= len(points1)).any():
-        raise InputError(
-            f"{file}: expected keypoints0 [N, 2], keypoints1 [M, 2], matches [N] from -1 to M - 1, "
-            "match_confidence [N], got others"
-        )
-    real = numbers >= 0
-    return FileMatches(
-        points0[real], points1[numbers[real]], confidence[real] if _NUMBERED[3] in parts else None, sizes
-    )
+    expected = " and ".join(_INLIERS[:2]) if verified else "points0 and points1, or matched_kpts0 and matched_kpts1"
+    raise InputError(f"{file}: expected {expected}, got {shorten(', '.join(sorted(parts))) or 'none'}")

@@ -4,26 +4,41 @@ Lists of image pairs are hloc's `query database` and kapture's `query, reference
 a folder of predictions, a text file for each query. To-Match adds the results of an image matcher.
 """
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
 
-from mfvpr.core.types import Ranking, Shortlist
-from mfvpr.io.containers import FileEntry, parse_number, read_npz, reading, shorten, write_npz
-from mfvpr.io.names import adds_folders, match_names, require_different
+from mfvpr.core.types import Shortlist
+from mfvpr.io.containers import (
+    FileEntry,
+    adds_folders,
+    match_names,
+    parse_number,
+    read_npz,
+    reading,
+    require_different,
+    shorten,
+    write_npz,
+)
 from mfvpr.io.pair_files import POSITIVES, PREDICTIONS, QUERY, read_num_inliers, read_predictions
 from mfvpr.utils.errors import InputError, require_word
 from mfvpr.utils.files import printable, require_replaceable, write_text
 
 PairLayout = Literal["hloc", "kapture", "preds"]
 _SEPARATORS = {"hloc": " \t\n\r", "kapture": ",\n\r", "preds": "\n\r"}  # characters that names must not contain
+Entries = list[FileEntry | None]
 ScoredPair = tuple[str, str, float | None]  # names of a query and a database image, and the score if the line has one
 
 
 def read_shortlist(
-    path: Path | str, query_names: Sequence[str], database_names: Sequence[str], *, num_candidates: int | None = None
+    path: Path | str,
+    query_names: Sequence[str],
+    database_names: Sequence[str],
+    *,
+    num_candidates: int | None = None,
+    check_entries: Callable[[Entries, Entries], None] | None = None,
 ) -> Shortlist:
     """Read the candidates that another program chose; a query's best candidate comes first.
 
@@ -32,32 +47,23 @@ def read_shortlist(
             Other suffixes: lines of text, `query database` as hloc, or `query, reference[, score]` as kapture and
             Patch-NetVLAD's predictions. A folder: `preds` of VPR-methods-evaluation; with To-Match's `.torch` files
             beside its text files, candidates are re-ranked by the number of inliers.
-        query_names: `[Q]` relative POSIX paths, matched as in `names.match_names`.
+        query_names: `[Q]` relative POSIX paths, matched as in `containers.match_names`.
         database_names: `[N]` likewise.
         num_candidates: C; None = the largest number of a query's candidates.
+        check_entries: called with the names of queries `[Q]` and database images `[N]` in a file of names, None unless
+            a name has additional folders: a file name alone may mean a query and a database image.
 
     Returns:
         Shortlist `[Q, C]`, NumPy, -1 if a query has fewer candidates (it may have none). If a query has a candidate
         twice, the first counts. Scores are those of the file, or C for the first candidate, then C - 1, ...
 
     Raises:
-        InputError: the file is missing or damaged; names are unknown or ambiguous; rows are out of range; scores are
-            not finite, ascending, or those of some pairs only.
-    """
-    return read_with_entries(path, query_names, database_names, num_candidates=num_candidates)[0]
-
-
-def read_with_entries(
-    path: Path | str, query_names: Sequence[str], database_names: Sequence[str], *, num_candidates: int | None = None
-) -> tuple[Shortlist, list[FileEntry | None], list[FileEntry | None]]:
-    """Shortlist as `read_shortlist` returns it, and the entries of queries `[Q]` and database images `[N]`.
-
-    Only names with additional folders are entries: a file name alone may mean a query and a database image.
+        InputError: a damaged file, unknown or ambiguous names, rows out of range, or scores that are not finite,
+            ascend, or are those of some pairs only.
     """
     path = Path(path)
     if num_candidates is not None and num_candidates < 1:
         raise InputError(f"num_candidates={num_candidates}: expected at least 1")
-    entries: Any = [None] * len(query_names), [None] * len(database_names)
     if path.suffix.lower() == ".npz":
         pairs = _from_npz(path, len(query_names), len(database_names))
     else:
@@ -65,7 +71,8 @@ def read_with_entries(
         queries, query_entries = _rows(path, query_names, (query for query, _, _ in names), "query")
         database, database_entries = _rows(path, database_names, (image for _, image, _ in names), "database")
         pairs = ((queries[query], database[image], score) for query, image, score in names)
-        entries = query_entries, database_entries
+        if check_entries is not None:
+            check_entries(query_entries, database_entries)
     candidates: list[dict[int, float | None]] = [{} for _ in query_names]  # database rows and scores, best first
     for query, row, score in pairs:
         candidates[query].setdefault(row, score)  # of several scores, the first counts
@@ -82,8 +89,7 @@ def read_with_entries(
         scores[query, :count] = np.arange(depth, depth - count, -1)
         if has_score == {True}:
             scores[query, :count] = _descending(f"{path}: {shorten(query_names[query])}", [*rows.values()])[:count]
-    shortlist = Shortlist(indices=indices, scores=scores, mask=indices >= 0)
-    return shortlist, *entries
+    return Shortlist(indices=indices, scores=scores, mask=indices >= 0)
 
 
 def write_shortlist(
@@ -95,21 +101,17 @@ def write_shortlist(
     layout: PairLayout = "hloc",
     positives: Sequence[Sequence[int]] | None = None,
 ) -> None:
-    """Write a shortlist as `read_shortlist` reads it, atomically.
+    """Write a shortlist `[Q, C]` as `read_shortlist` reads it, atomically.
 
     Args:
         path: `.npz`: `predictions` int32 and `scores` float32 `[Q, C]`; other suffixes: a line for each pair.
-        shortlist: `[Q, C]`.
-        query_names: `[Q]`.
-        database_names: `[N]`.
+        query_names, database_names: `[Q]` and `[N]`; full paths, if another program shall read the images.
         layout: of text. `hloc`: no scores; `kapture`: scores with all digits of float32; `preds`: a new folder `path`
-            of VPR-methods-evaluation's predictions, without scores. Other programs read the images there, if the
-            names are full paths.
+            of VPR-methods-evaluation's predictions, without scores.
         positives: `[Q]` database rows of the correct images of each query, for `preds`; None = not listed.
 
     Raises:
-        InputError: the file exists; names are missing or do not fit a line; or written scores are not finite, or
-            ascending.
+        InputError: the file exists, names do not fit a line, or written scores are not finite or ascend.
     """
     path = Path(path)
     require_word("layout", layout, PairLayout)
@@ -146,14 +148,6 @@ def write_shortlist(
         score = str(np.float32(scores[query, position]))
         lines.append(" ".join(names) if layout == "hloc" else ", ".join([*names, score]))
     write_text(path, "\n".join(lines) + "\n")
-
-
-def reranked_shortlist(shortlist: Shortlist, ranking: Ranking) -> Shortlist:
-    """The shortlist in the order of a ranking, with its scores, `[Q, C]`."""
-    order = np.asarray(ranking.order)
-    parts = (shortlist.indices, ranking.scores, shortlist.mask)
-    indices, scores, mask = (np.take_along_axis(np.asarray(part), order, 1) for part in parts)
-    return Shortlist(indices=np.where(mask, indices, -1), scores=np.where(mask, scores, 0), mask=mask)
 
 
 def _from_npz(path: Path, num_queries: int, num_database: int) -> Iterator[tuple[int, int, float | None]]:
@@ -205,9 +199,7 @@ def _read_predictions(folder: Path) -> list[ScoredPair]:
     return pairs
 
 
-def _rows(
-    path: Path, names: Sequence[str], foreign: Iterable[str], side: str
-) -> tuple[dict[str, int], list[FileEntry | None]]:
+def _rows(path: Path, names: Sequence[str], foreign: Iterable[str], side: str) -> tuple[dict[str, int], Entries]:
     """Row of each foreign name, and the entry of each image; an InputError for unknown names."""
     foreign = dict.fromkeys(foreign)
     rows = {name: row for row, name in enumerate(match_names(path, names, foreign)) if name is not None}

@@ -62,7 +62,7 @@ def read_stamps(path: Path | str, num_images: int) -> list[int]:
 
 
 def read_poses(path: Path | str, names: Sequence[str]) -> list[str]:
-    """Poses of the images `names`, each as the text of its numbers with a space between them.
+    """Poses of images, `[M]` texts of 7 or 12 numbers with a space between them, digit for digit as in the file.
 
     Args:
         path: TUM, lines `timestamp tx ty tz qx qy qz qw`, or KITTI, lines of 12 numbers: the first three rows of the
@@ -70,12 +70,8 @@ def read_poses(path: Path | str, names: Sequence[str]) -> list[str]:
         names: `[M]` relative POSIX paths in natural order. If they are times, as `stamps_in_names` reads them, TUM's
             timestamps must be the same within 10 ms.
 
-    Returns:
-        `[M]` texts of 7 or 12 numbers, digit for digit as in the file.
-
     Raises:
-        InputError: the file is missing or damaged; a line has other numbers; timestamps do not ascend, or differ from
-            the images'; or the number of poses is not M.
+        InputError: other numbers, timestamps that do not ascend or differ from the images', or not M poses.
     """
     path = Path(path)
     lines = [(where, line.split()) for where, line in _lines(path, "a text file of poses")]
@@ -107,20 +103,15 @@ def read_poses(path: Path | str, names: Sequence[str]) -> list[str]:
 
 
 def write_trajectory(path: Path | str, poses: Sequence[str | None], stamps: Sequence[int] | None = None) -> None:
-    """Write the poses of localized images, atomically, digit for digit.
-
-        poses = mfvpr.io.read_poses("database.tum", data.database.names)
-        stamps = mfvpr.io.stamps_in_names(data.queries.names)
-        write_trajectory("queries.tum", [poses[row] for row in rows], stamps)  # database rows of the predictions
+    """Write the poses of localized images to a new text file, atomically, digit for digit.
 
     Args:
-        path: new text file.
         poses: `[Q]` texts of 7 numbers (TUM) or 12 (KITTI), as `read_poses` returns them; None = no place, which a
             frame of KITTI must have.
         stamps: `[Q]` different times in ns, for TUM, whose lines are in their order; None for KITTI.
 
     Raises:
-        InputError: the file exists; poses are missing or have other numbers; or two images have the same time.
+        InputError: the file exists, poses are missing or have other numbers, or two images have the same time.
     """
     path = Path(path)
     places = [pose for pose in poses if pose is not None]

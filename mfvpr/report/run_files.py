@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool
 
-from mfvpr.datasets.contents import Contents, fingerprints, readings
+from mfvpr.datasets.contents import Contents, fingerprints
 from mfvpr.datasets.positives import stack_positives
 from mfvpr.datasets.published import published_differences
 from mfvpr.evaluation.confidence import write_confidences
@@ -142,7 +142,6 @@ def write_run_folder(folder: Path, report: EvaluationReport, description: RunDes
         "incomplete": list(published_differences(dataset)),
         "description": heading(report, description),
         "ground_truth": ground_truth(report, description),
-        "reading": readings(description.contents),
         "seconds": report.ranked.seconds,
     }
     lines, parameters = [], _parameters(report, description.settings)

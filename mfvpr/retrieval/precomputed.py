@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, fields, replace
+from functools import partial
 from pathlib import Path
 from typing import Any, Literal
 
@@ -13,12 +14,11 @@ from mfvpr.core.types import Shortlist
 from mfvpr.datasets.datasets import ImageFolder, QuerySequence
 from mfvpr.datasets.image_reading import Interpolation, read_size
 from mfvpr.features.extractor import Scale
-from mfvpr.io.features import ImportedFeatures, Lengths, open_features
-from mfvpr.io.features import read_descriptors_with_entries as read_descriptors
+from mfvpr.io.containers import ImageOfEntry, require_one_image
+from mfvpr.io.features import ImportedFeatures, Lengths, open_features, read_global_descriptors
 from mfvpr.io.matches import Images, ImportedMatches, open_matches
-from mfvpr.io.names import ImageOfEntry, require_one_image
 from mfvpr.io.pair_files import content_paths
-from mfvpr.io.shortlists import read_with_entries as read_shortlist
+from mfvpr.io.shortlists import Entries, read_shortlist
 from mfvpr.retrieval.retriever import RetrievalResult
 from mfvpr.retrieval.search import EXACT, Search
 from mfvpr.storage.feature_cache import FeatureCache
@@ -89,9 +89,8 @@ class DescriptorFiles(_FolderFiles):
 
     def _read(self, folder: ImageFolder) -> Float[np.ndarray, "images dimensions"]:
         file = _file_of(self.files, folder)
-        vectors, entries = read_descriptors(file.path, file.names(folder), lengths=self.lengths)
-        require_one_image(file.path, folder.paths, entries, self._images)
-        return vectors
+        check = partial(require_one_image, file.path, folder.paths, known=self._images)
+        return read_global_descriptors(file.path, file.names(folder), lengths=self.lengths, check_entries=check)
 
 
 @dataclass(frozen=True)
@@ -107,15 +106,18 @@ class ShortlistFiles:
         """See `Retriever`; candidates that the sequence excludes are removed, and those beyond them move up."""
         file, queries, known = _file_of(self.files, sequence.images), sequence.images, ImageOfEntry()
         names = [self.database_prefix + name for name in database.names]
-        shortlist, query_entries, entries = read_shortlist(file.path, file.names(queries), names)
         here, elsewhere = (f"/{each.root.absolute().as_posix().strip('/')}/" for each in (database, queries))
-        for name, entry in zip(database.names, entries, strict=True):
-            start = "/" if entry is None else "/" + entry.name.removesuffix(name).lstrip("/")
-            if start != "/" and elsewhere.endswith(start) and not here.endswith(start):
-                got = f"those in {queries.root}; exchange dataset.database and dataset.queries, or the file's columns"
-                raise InputError(f"{file.path}: expected names of images in {database.root}, got {got}")
-        require_one_image(file.path, database.paths, entries, known)
-        require_one_image(file.path, queries.paths, query_entries, known)
+
+        def check(query_entries: Entries, entries: Entries) -> None:
+            for name, entry in zip(database.names, entries, strict=True):
+                start = "/" if entry is None else "/" + entry.name.removesuffix(name).lstrip("/")
+                if start != "/" and elsewhere.endswith(start) and not here.endswith(start):
+                    got = f"those in {queries.root}; exchange dataset.database and dataset.queries, or its columns"
+                    raise InputError(f"{file.path}: expected names of images in {database.root}, got {got}")
+            require_one_image(file.path, database.paths, entries, known)
+            require_one_image(file.path, queries.paths, query_entries, known)
+
+        shortlist = read_shortlist(file.path, file.names(queries), names, check_entries=check)
         if sequence.excluded is not None:
             shortlist = replace(shortlist, mask=shortlist.mask & ~sequence.excluded.contains(shortlist.indices))
         return RetrievalResult(_cut(shortlist, num_candidates), {}, {})
@@ -133,10 +135,6 @@ def _cut(shortlist: Shortlist, num_candidates: int) -> Shortlist:
 @dataclass(frozen=True)
 class MatchFiles:
     """Matches of another program in place of a matcher, see `mfvpr.io.open_matches` for `verified` and `confidences`.
-
-        files = {data.queries.root: File("matches.h5")}
-        features = {folder.root: File("feats.h5") for folder in (data.queries, data.database)}
-        pipeline = mfvpr.Pipeline(extractor, retriever, MatchFiles(files, features=features))
 
     The extractor of the pipeline is used only for retrieval.
     """
@@ -157,7 +155,6 @@ class MatchFiles:
 
     @property
     def inputs(self) -> Literal["images"]:
-        """See `mfvpr.matchers.host_matcher.PairSource`."""
         return "images"
 
     def open(self, queries: ImageFolder, database: ImageFolder) -> ImportedMatches:
@@ -182,8 +179,8 @@ class MatchFiles:
 
 
 def _file_of(files: Mapping[Path, File], folder: ImageFolder) -> File:
-    files = {Path(root): file for root, file in files.items()}
-    if folder.root not in files:
+    file = {Path(root): file for root, file in files.items()}.get(folder.root)
+    if file is None:
         known = ", ".join(map(str, files)) or "none"
         raise InputError(f"{folder.root}: expected a folder that has a file, one of: {known}; give one for it as well")
-    return files[folder.root]
+    return file

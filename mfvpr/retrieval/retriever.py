@@ -66,7 +66,6 @@ class Retrieval:
 class SsmVoting:
     """Candidates by votes (SSM-VPR): each query window votes for the images of its C nearest database windows.
 
-    Among images with equal votes the lowest row comes first; the public code's unstable sort leaves their order open.
     Images without votes fill the rest of the shortlist.
     """
 
@@ -92,7 +91,7 @@ def vote(
     *,
     excluded: Positives | None = None,
 ) -> Shortlist:
-    """Candidates by votes, NumPy: most votes first, then the lowest row.
+    """Candidates by votes, NumPy: most votes first, then the lowest row (the public code leaves their order open).
 
     Each query window votes for `num_candidates` windows. A query with a window that is not finite has no candidates; a
     database image with such a window is no candidate. Windows of `excluded` images get no votes.
@@ -131,10 +130,8 @@ def fit_to_database(tool: Tool, database: ImageFolder, cache: FeatureCache) -> T
 
         cells = fit_to_database(SsmCells(model), database, cache)  # as `mfvpr.evaluate` does
 
-    If the cache has a root, a learned part is stored there as one `.npz` file, named by the images' content and all
-    settings; its content is part of the recipe of everything that is computed with it. Parts that are learned already
-    stay the same, even if they were learned from another database. Images that cannot be read or are too few raise an
-    `InputError`.
+    The cache stores learned parts, by the images' content and all settings. Parts that are learned already stay the
+    same, even if from another database. Images that cannot be read or are too few raise an `InputError`.
     """
     if isinstance(tool, WindowExtractor) and isinstance(tool.whitening, WindowFitting):
         fitting = tool.whitening

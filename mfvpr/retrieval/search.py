@@ -29,8 +29,7 @@ Database = Float[np.ndarray, "database dimensions"]
 class ExactSearch:
     """Search for the largest dot products in chunks that fit into memory, with the result of `retrieve`.
 
-    Above 65,536 database rows, the last bits of scores depend on the block of 65,536 rows: of equal descriptors in
-    different blocks, any may come first. On a CPU, no bit depends on the free memory.
+    Of equal descriptors in different blocks of 65,536 database rows, any may come first: last bits depend on the block.
     """
 
     def fit(self, database: Database) -> "ExactSearch":
@@ -71,18 +70,13 @@ EXACT = ExactSearch()
 
 @dataclass(frozen=True)
 class WhitenedSearch:
-    """Search by whitened descriptors: principal components with unit variance, scaled to unit length.
+    """Search by whitened descriptors: principal components of the database (Jegou & Chum, ECCV 2012).
 
-    See Jegou & Chum, ECCV 2012. The components are those of the database: queries lose directions in which the database
-    does not vary.
-
-    Attributes:
-        dimension: D', number of components.
-        whitening: the learned components; None = `shortlist` learns them from the database.
+    Components have unit variance; together they are scaled to unit length.
     """
 
-    dimension: int
-    whitening: Whitening | None = None
+    dimension: int  # D', number of components
+    whitening: Whitening | None = None  # the learned components; None = `shortlist` learns them from the database
 
     def fit(self, database: Database) -> "WhitenedSearch":
         """Search with the principal components of a database; itself if they were learned."""

@@ -9,7 +9,6 @@ from PIL import Image
 
 from mfvpr.cli.evaluation import evaluate
 from mfvpr.cli.jobs import prepare
-from mfvpr.datasets.contents import readings
 from mfvpr.utils import Stopwatch
 from tests.programs import csv_rows, folder, settings_of
 
@@ -94,20 +93,12 @@ def test_pairs_of_an_index_file_are_all_that_is_right_unless_asked(small_street,
     assert recall(exact) == recall(widened, tolerance=0)
 
 
-def test_turned_and_16_bit_images_are_told(tmp_path, capsys):
+def test_images_of_12_bits_in_files_of_16_are_warned_of(tmp_path, capsys):
     for side in ("database", "queries"):
         (tmp_path / side).mkdir()
-    exif = Image.Exif()
-    exif[0x0112] = 6
-    Image.new("RGB", (120, 160)).save(tmp_path / "database" / "0.png", exif=exif)
-    Image.fromarray(np.full((120, 160), 65535, np.uint16)).save(tmp_path / "queries" / "0.png")
-    data = folder(tmp_path)[:3]
-    inputs = prepare(settings_of(*QUICK, *data, "dataset.ground_truth=order"), Stopwatch())
-    assert readings(inputs.contents) == {
-        "database": {"orient": True, "turned": 1, "bits": 16, "scaled_16bit": 0, "largest_16bit": None},
-        "query": {"orient": True, "turned": 0, "bits": 16, "scaled_16bit": 1, "largest_16bit": 65535},
-    }  # fmt: skip
-    assert "warning: the largest value" not in capsys.readouterr().err
+        Image.fromarray(np.full((120, 160), 4095, np.uint16)).save(tmp_path / side / "0.png")
+    prepare(settings_of(*QUICK, *folder(tmp_path)[:3], "dataset.ground_truth=order"), Stopwatch())
+    assert "16-bit images is 4095: they look dark; use dataset.bits=12" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize("value", ["", None, "elsewhere"])

@@ -161,7 +161,7 @@ def test_what_does_not_count_is_never_shown_as_right(outcome):
     excluded[query, truth.place(query)] = True
 
     def predictions(excluded):
-        page = page_of(outcome, truth=AllowedTruth(truth, Positives.from_matrix(excluded)))
+        page = page_of(outcome, truth=AllowedTruth(truth, Positives(excluded)))
         return [prediction.caption for prediction in page.correct_candidates(query)]
 
     other = int(np.argmax(outcome.report.positives[0].dense()[query] & ~excluded[query]))

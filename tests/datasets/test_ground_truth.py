@@ -8,15 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from mfvpr import InputError, datasets
-from mfvpr.datasets import (
-    AllowedTruth,
-    FrameTruth,
-    IndexFile,
-    LabelFiles,
-    LabelTruth,
-    Positives,
-    RadiusTruth,
-)
+from mfvpr.datasets import AllowedTruth, FrameTruth, IndexFile, LabelFiles, LabelTruth, Positives, RadiusTruth
 from mfvpr.datasets.ground_truth import threshold_words
 from mfvpr.utils.files import write_text
 from tests import oracles
@@ -160,13 +152,13 @@ def test_frames_are_a_loop_over_all_pairs(tolerance):
 
 def test_excluded_images_are_not_correct():
     excluded = np.array([[False, True, True, False], [True, False, False, False]])
-    truth = AllowedTruth(FrameTruth(((1,), (0,)), 4), Positives.from_matrix(excluded))
+    truth = AllowedTruth(FrameTruth(((1,), (0,)), 4), Positives(excluded))
     np.testing.assert_array_equal(truth.positives(1).dense(), [[True] + [False] * 3, [False, True, False, False]])
     np.testing.assert_array_equal(truth.shows_place(1).dense(), [[True] * 3 + [False], [True, True, False, False]])
     assert not truth.positives(0).rows.size
     np.testing.assert_array_equal(truth.shows_place(0).dense(), excluded)  # more than the tolerance alone
     assert (truth.place(0), truth.place(1), truth.unit) == (0, 1, "frames")
-    assert AllowedTruth(truth, Positives.from_matrix(np.ones_like(excluded))).place(0) is None
+    assert AllowedTruth(truth, Positives(np.ones_like(excluded))).place(0) is None
 
 
 @pytest.mark.parametrize(

@@ -25,7 +25,7 @@ def check_same(got, matrix):
 
 @given(matrices)
 def test_they_are_the_matrix(matrix):
-    got = Positives.from_matrix(matrix)
+    got = Positives(matrix)
     check_same(got, matrix)
     np.testing.assert_array_equal(got.dense(), matrix)
     np.testing.assert_array_equal(got.counts, matrix.sum(axis=1))
@@ -47,7 +47,7 @@ def test_rows_come_in_any_order_and_any_number_of_times(matrix, seed):
 
 @given(matrices, seeds)
 def test_of_some_queries(matrix, seed):
-    rng, got = np.random.default_rng(seed), Positives.from_matrix(matrix)
+    rng, got = np.random.default_rng(seed), Positives(matrix)
     mask = rng.random(len(matrix)) < 0.5
     numbers = rng.integers(0, max(len(matrix), 1), 9 * bool(len(matrix)))
     for queries in (mask, numbers, slice(1, 4), slice(None, None, -2), []):
@@ -58,7 +58,7 @@ def test_of_some_queries(matrix, seed):
 
 @given(pairs)
 def test_union_and_difference(pair):
-    first, second = map(Positives.from_matrix, pair)
+    first, second = map(Positives, pair)
     check_same(first | second, pair[0] | pair[1])
     check_same(first - second, pair[0] & ~pair[1])
 
@@ -69,7 +69,7 @@ def test_rankings_are_looked_up(matrix, seed, several):
     rows = rng.integers(-2, matrix.shape[1], (*several, len(matrix), 4)).astype(rng.choice(["i4", "i8"]))
     query = np.arange(len(matrix))[:, None]
     expected = matrix[query, np.maximum(rows, 0)] & (rows >= 0) if matrix.size else np.zeros(rows.shape, bool)
-    np.testing.assert_array_equal(Positives.from_matrix(matrix).contains(rows), expected)
+    np.testing.assert_array_equal(Positives(matrix).contains(rows), expected)
 
 
 @pytest.mark.parametrize("rows", [np.zeros((3, 1), int), np.zeros(2, int), np.array([[0], [4]]), np.zeros((2, 1))])
@@ -81,9 +81,9 @@ def test_rankings_of_other_data_are_errors(rows):
 def test_values_that_do_not_fit_are_errors():
     got = Positives.from_rows([[0], [0, 1]], 4)
     for rows in ([[4]], [[0], [-1]], [[2**32]], [[0.5]], np.eye(2, dtype=bool)):
-        with pytest.raises(InputError, match=r"positives: .*4 images, got .*from_matrix"):
+        with pytest.raises(InputError, match=r"positives: .*4 images, got .*takes matrices"):
             Positives.from_rows(rows, 4)
     with pytest.raises(ValueError, match="inconsistent shape"):
         got | Positives.from_rows([[0], [0]], 5)
     with pytest.raises(InputError, match="expected a matrix"):
-        Positives.from_matrix(np.ones(3, bool))
+        Positives(np.ones(3, bool))

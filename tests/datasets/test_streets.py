@@ -8,16 +8,8 @@ import numpy as np
 import pytest
 
 from mfvpr.datasets.streets import CONDITIONS, TRUTH, draw_streets, streets_folder
-from mfvpr.datasets.streets.camera import (
-    LANE,
-    SPACING,
-    Camera,
-    Facade,
-    image_shift,
-    plan_drives,
-    plan_return,
-    visible_points,
-)
+from mfvpr.datasets.streets.drawing import SPACING, Camera, image_shift, plan_drives, plan_return, visible_points
+from mfvpr.datasets.streets.scene import LANE, Facade
 
 pytestmark = pytest.mark.thorough
 

@@ -145,7 +145,7 @@ def test_places_that_the_map_does_not_show_are_none(unit):
 def test_halves_never_share_a_place(tolerance):
     places = np.arange(20)
     matrix = frame_positives(places, places, tolerance=tolerance)
-    positives = Positives.from_matrix(matrix)
+    positives = Positives(matrix)
     for half in halves(positives):
         near = {place for query in half.report for place in range(query - tolerance, query + tolerance + 1)}
         assert set(np.flatnonzero(~half.allowed)) == near & set(range(20))

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from mfvpr import InputError, Shortlist
 from mfvpr.io import write_features, write_global_descriptors, write_shortlist
-from mfvpr.io.names import match_names
+from mfvpr.io.containers import match_names
 from tests.io.checks import one_line_error
 from tests.io.other_programs import feature
 

@@ -10,8 +10,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from mfvpr import InputError, Ranking, Shortlist
-from mfvpr.io import Images, open_matches, read_shortlist, reranked_shortlist, write_shortlist
+from mfvpr import InputError, Shortlist
+from mfvpr.io import Images, open_matches, read_shortlist, write_shortlist
 from tests.io.checks import one_line_error
 from tests.io.match_files import POINTS, pair_of
 from tests.needs import needs
@@ -178,16 +178,6 @@ def test_to_match_reads_what_is_written(tmp_path, positives):
     listed = [] if positives is None else ["Positives paths:", "d/3.jpg", "d/4.jpg", ""]
     assert texts[0][7:] == listed
     assert texts[2][6:] == listed[::3]
-
-
-def test_a_ranking_is_written_as_a_shortlist(tmp_path):
-    shortlist = shortlist_of([[3, 1, 0], [2, -1, -1]])
-    ranking = Ranking(order=np.array([[2, 0, 1], [0, 1, 2]]), scores=np.float32([[5, 3, 9], [1, 0, 0]]))
-    write_shortlist(tmp_path / "p.npz", reranked_shortlist(shortlist, ranking), QUERIES[:2], DATABASE)
-    with np.load(tmp_path / "p.npz") as arrays:
-        assert arrays["predictions"].tolist() == [[0, 3, 1], [2, -1, -1]]
-        assert arrays["scores"].tolist() == [[9, 5, 3], [1, 0, 0]]
-        assert (arrays["predictions"].dtype, arrays["scores"].dtype) == (np.int32, np.float32)
 
 
 def test_what_cannot_be_written(tmp_path):

@@ -119,6 +119,8 @@ def test_radius_is_inclusive_and_keeps_centimeters_at_utm_size():
     queries, places = rng.uniform(0, 100, (20, 2)), rng.uniform(0, 100, (30, 2))
     expected = oracles.radius_positives(queries, places, 25.0)
     np.testing.assert_array_equal(radius_positives(queries, places), expected)
+    with unchecked_shapes(), pytest.raises(InputError, match=r"expected \(x, y\) \[images, 2\]"):
+        radius_positives(np.ones((2, 3)), np.ones((2, 3)))
 
 
 @given(st.integers(0, 2**32 - 1), st.integers(1, 6))
@@ -132,7 +134,7 @@ def test_recall(seed, depth):
         recall_at_k(np.stack([order, order]), positives, ks)
     expected = oracles.recall_at_k(order, positives, ks)
     np.testing.assert_allclose(recall_at_k(order, positives, ks), expected)
-    np.testing.assert_array_equal(recall_at_k(order, Positives.from_matrix(positives), ks), expected)
+    np.testing.assert_array_equal(recall_at_k(order, Positives(positives), ks), expected)
 
 
 def test_descriptors_of_different_lengths_and_masks_of_another_shape_are_refused():

@@ -1,49 +1,84 @@
-"""The folders of the synthetic street, complete or absent: images of panels in true perspective, and ground truth."""
+"""The folders of the synthetic street: drives of a pinhole camera past panels in true perspective, and ground truth."""
 
 import os
 import tempfile
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor, as_completed
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import cv2
 import numpy as np
+from jaxtyping import Bool, Float
 
-from mfvpr.datasets.streets.camera import (
-    CAMERA_HEIGHT,
-    NEAR,
-    SPACING,
-    Camera,
-    image_shift,
-    plan_drives,
-    plan_return,
-    visible_points,
-)
-from mfvpr.datasets.streets.scene import Scene, build_scene, traffic
+from mfvpr.datasets.streets.scene import LANE, Facade, Scene, build_scene, traffic
 from mfvpr.datasets.streets.sheets import WEATHERS, Floats, Image, Panel, Prop, Rng, Weather
 from mfvpr.utils.numerics import available_cpus
 from mfvpr.utils.runtime import Track, no_progress
 
 VERSION = 1  # of the images: raise it when they change, so that old caches are not used for new ones
-OVERSAMPLING = 1.5  # size of the canvas per size of the image, against jagged edges
+NEAR = 0.5  # objects that are nearer to the camera are invisible, meters
 SIGHT = 100.0  # panels farther away are not drawn, meters
+CAMERA_HEIGHT = 1.6  # meters
+SPACING = 1.75  # between frames, meters
+STEP = 8  # px between the points that shifts are measured at
+OVERSAMPLING = 1.5  # size of the canvas per size of the image, against jagged edges
 CONDITIONS = ("dawn", "dusk", "night", "night-rain", "winter", "rain", "snow")  # those of RobotCar Seasons
 TRUTH = "ground_truth.csv"
+_DEGREE = np.pi / 180
+
+
+@dataclass(frozen=True)
+class Camera:
+    """A pinhole camera at (x, -CAMERA_HEIGHT, z), in meters; angles in radians, heading to the right, pitch up."""
+
+    x: float
+    z: float
+    heading: float
+    pitch: float
+    image_size: tuple[int, int]  # width, height in px
+
+    @property
+    def focal(self) -> float:
+        """Focal length in px."""
+        return 0.7 * self.image_size[0]
+
+    def rotation(self) -> Float[np.ndarray, "3 3"]:
+        """Rows: the camera's right, down and forward axes in the world."""
+        sin_h, cos_h, sin_p, cos_p = (f(a) for a in (self.heading, self.pitch) for f in (np.sin, np.cos))
+        forward = np.array([sin_h * cos_p, -sin_p, cos_h * cos_p])
+        right = np.array([cos_h, 0.0, -sin_h])
+        return np.stack([right, np.cross(forward, right), forward])
+
+    def center(self) -> Float[np.ndarray, "3"]:
+        return np.array([self.x, -CAMERA_HEIGHT, self.z])
+
+    def projection(self) -> Float[np.ndarray, "3 4"]:
+        """The matrix from world points (x, y, z, 1) to homogeneous px; the last row gives the depth in m."""
+        width, height = self.image_size
+        intrinsics = np.array([[self.focal, 0, width / 2], [0, self.focal, height / 2], [0, 0, 1]])
+        rotation = self.rotation()
+        return intrinsics @ np.column_stack([rotation, -rotation @ self.center()])
+
+    def project(
+        self, points: Float[np.ndarray, "points 3"]
+    ) -> tuple[Float[np.ndarray, "points 2"], Bool[np.ndarray, " points"]]:
+        """World points to px, and which of them lie inside the image."""
+        homogeneous = np.column_stack([points, np.ones(len(points))]) @ self.projection().T
+        pixels = homogeneous[:, :2] / np.maximum(homogeneous[:, 2:], NEAR)
+        inside = (homogeneous[:, 2] > NEAR) & np.all((pixels >= 0) & (pixels < self.image_size), axis=1)
+        return pixels, inside
 
 
 @dataclass(frozen=True)
 class Drive:
-    """The images of one folder, with a camera and the name of a weather per frame.
-
-    `ground_truth` is the file with the shifts to the database's frames; None = this is the database.
-    """
+    """The images of one folder, with a camera and the name of a weather per frame."""
 
     folder: Path
     cameras: list[Camera]
     weathers: list[str]
     seed: tuple[int, ...]
-    ground_truth: Path | None = None
+    ground_truth: Path | None = None  # file with the shifts to the database's frames; None = this is the database
 
 
 def draw_streets(
@@ -75,8 +110,7 @@ def draw_streets(
     """
     folder = Path(folder)
     database, queries = plan_drives(seed, num_frames, image_size)
-    key = (seed, 10, 0) if seasons else (seed, 7)
-    drives = [Drive(folder / "database", database, ["day"] * num_frames, key)]
+    drives = [Drive(folder / "database", database, ["day"] * num_frames, (seed, 10, 0) if seasons else (seed, 7))]
     if not seasons:
         weathers = ["night"] * (num_frames // 2) + ["snow"] * (num_frames - num_frames // 2)
         drives.append(Drive(folder / "queries", queries, weathers, (seed, 8), folder / TRUTH))
@@ -99,21 +133,62 @@ def streets_folder(
 
     It is renamed when complete, so that a killed run leaves nothing that looks complete.
     """
-    kind = "seasons" if seasons else "streets"
-    folder = Path(cache) / f"{kind}-v{VERSION}-seed{seed}-{num_frames}x{image_size[0]}x{image_size[1]}"
-    if not folder.exists():
-        folder.parent.mkdir(parents=True, exist_ok=True)
-        with tempfile.TemporaryDirectory(dir=folder.parent, prefix=".drawing-") as temporary:
-            drawing = Path(temporary) / folder.name
-            draw_streets(
-                drawing, seasons=seasons, seed=seed, num_frames=num_frames, image_size=image_size, progress=progress
-            )
-            try:
-                os.replace(drawing, folder)
-            except OSError:
-                if not folder.exists():  # otherwise another process was faster, with the same result
-                    raise
+    kind, (width, height) = "seasons" if seasons else "streets", image_size
+    folder = Path(cache) / f"{kind}-v{VERSION}-seed{seed}-{num_frames}x{width}x{height}"
+    if folder.exists():
+        return folder
+    folder.parent.mkdir(parents=True, exist_ok=True)
+    options = {"seasons": seasons, "seed": seed, "num_frames": num_frames, "image_size": image_size}
+    with tempfile.TemporaryDirectory(dir=folder.parent, prefix=".drawing-") as temporary:
+        drawing = Path(temporary) / folder.name
+        draw_streets(drawing, **options, progress=progress)
+        try:
+            os.replace(drawing, folder)
+        except OSError:
+            if not folder.exists():  # otherwise another process was faster, with the same result
+                raise
     return folder
+
+
+def plan_drives(seed: int, count: int, image_size: tuple[int, int]) -> tuple[list[Camera], list[Camera]]:
+    """The `count` cameras of the database and of the queries, in driving order; `image_size` is (width, height), px.
+
+    The database keeps to the lane; the queries shift by 0.3 to 1.2 m to either side and turn by up to 9 degrees.
+    """
+    rng = np.random.default_rng([seed, 6])
+    queries = _weave(rng, count, image_size)
+    wobble = 0.3 * _DEGREE * rng.standard_normal((2, count))
+    poses = zip(queries, *wobble, strict=True)
+    return [Camera(LANE, query.z, heading, pitch, image_size) for query, heading, pitch in poses], queries
+
+
+def plan_return(seed: int, number: int, count: int, image_size: tuple[int, int]) -> list[Camera]:
+    """The cameras of drive `number` on another day, with another lane, other headings and positions between frames.
+
+    Frame i is at most 0.4 of the database's spacing away from the database's frame i.
+    """
+    rng = np.random.default_rng([seed, 9, number])
+    cameras = _weave(rng, count, image_size)
+    places = SPACING * (np.arange(count) + rng.uniform(-0.2, 0.2) + 0.2 * _smooth_walk(rng, count))
+    return [replace(camera, z=z) for camera, z in zip(cameras, places, strict=True)]
+
+
+def _weave(rng: Rng, count: int, image_size: tuple[int, int]) -> list[Camera]:
+    """Cameras that leave the lane and the direction of the street."""
+    shift = _smooth_walk(rng, count)
+    lane = LANE + np.where(shift < 0, -1, 1) * (0.3 + 0.9 * np.abs(shift))
+    heading = _DEGREE * (7.5 * _smooth_walk(rng, count) + np.clip(0.5 * rng.standard_normal(count), -1, 1))
+    pitch = _DEGREE * (1.0 * _smooth_walk(rng, count) + 0.3 * rng.standard_normal(count))
+    places = SPACING * np.arange(count)
+    return [Camera(*pose, image_size) for pose in zip(lane, places, heading, pitch, strict=True)]
+
+
+def _smooth_walk(rng: Rng, count: int) -> Floats:
+    """Smooth random values `[count]` in [-1, 1], similar over 8 frames."""
+    steps = np.arange(-30, 31)
+    kernel = np.exp(-0.5 * (steps / 8.0) ** 2)
+    walk = np.convolve(rng.standard_normal(count + len(steps) - 1), kernel, mode="valid")
+    return np.clip(1.3 * walk / np.sqrt(np.sum(kernel**2)) / 2, -1, 1)
 
 
 def draw_drives(drives: Sequence[Drive], seed: int, length: float, progress: Track = no_progress) -> None:
@@ -139,23 +214,50 @@ def draw_drives(drives: Sequence[Drive], seed: int, length: float, progress: Tra
         pool.shutdown(cancel_futures=True)
 
 
+def visible_points(facades: Iterable[Facade], camera: Camera) -> Float[np.ndarray, "points 3"]:
+    """Points on the nearest facades, seen through a grid of every `STEP`-th px of the image."""
+    width, height = camera.image_size
+    u, v = np.meshgrid(np.arange(STEP / 2, width, STEP), np.arange(STEP / 2, height, STEP))
+    rays = np.stack([(u - width / 2) / camera.focal, (v - height / 2) / camera.focal, np.ones_like(u)], -1)
+    rays = rays.reshape(-1, 3) @ camera.rotation()
+    nearest = np.full(len(rays), np.inf)
+    for facade in facades:
+        with np.errstate(divide="ignore", invalid="ignore"):
+            distance = (facade.x - camera.x) / rays[:, 0]
+            points = camera.center() + distance[:, None] * rays
+        hit = (distance > 0) & (points[:, 2] >= facade.start) & (points[:, 2] <= facade.end)
+        hit &= (points[:, 1] <= 0) & (points[:, 1] >= -facade.height)
+        nearest = np.where(hit & (distance < nearest), distance, nearest)
+    hits = np.isfinite(nearest)
+    return camera.center() + nearest[hits, None] * rays[hits]
+
+
+def image_shift(points: Float[np.ndarray, "points 3"], query: Camera, database: Camera) -> tuple[float, float]:
+    """Shift (x, y) in px that moves the scene of the query image onto the database image.
+
+    It is the median per axis of the position there minus the position here, over the world points inside both images.
+    """
+    (before, inside_query), (after, inside_database) = query.project(points), database.project(points)
+    x, y = np.median((after - before)[inside_query & inside_database], axis=0)
+    return float(x), float(y)
+
+
 def draw_frame(scene: Scene, drive: Drive, row: int) -> None:
     """Draw one image of a drive and write it: panels from far to near, then lens, air and sensor."""
     rng, camera, weather = np.random.default_rng((*drive.seed, row)), drive.cameras[row], WEATHERS[drive.weathers[row]]
     cars = scene.cars[1::2] if drive.ground_truth is None else scene.cars[::2]  # no query meets a car of the database
-    # Objects on the street are never behind a house, hence houses are painted first.
-    layers = (scene.ground, scene.houses, (*scene.street, *traffic(cars, camera, rng)))
-    near = ([prop for prop in layer if prop.z < camera.z + SIGHT] for layer in layers)
     z = camera.z + 4.0  # the sky is so far away that it moves along with the camera
     sky = Panel(scene.sky, (camera.x - 8, -CAMERA_HEIGHT - 3.9, z), (16, 0, 0), (0, 4.0, 0))
+    # Objects on the street are never behind a house, hence houses are painted first.
+    layers = ([Prop(z, (sky,))], scene.ground, scene.houses, (*scene.street, *traffic(cars, camera.z, rng)))
     width, height = camera.image_size
     size = (round(width * OVERSAMPLING), round(height * OVERSAMPLING))
     canvas = np.empty((size[1], size[0], 4), np.uint8)
     canvas[:] = (*weather.horizon, 255)
     projection = np.diag([size[0] / width, size[1] / height, 1.0]) @ camera.projection()
-    for layer in ([Prop(z, (sky,))], *near):
+    for layer in layers:
         for prop in sorted(layer, key=lambda prop: -prop.z):
-            for panel in prop.panels:
+            for panel in prop.panels if prop.z < camera.z + SIGHT else ():
                 paint_panel(canvas, projection, panel, weather)
     image = expose(cv2.resize(canvas, (width, height), interpolation=cv2.INTER_AREA)[..., :3], weather, rng)
     path = drive.folder / f"{row:04d}.png"

@@ -5,25 +5,12 @@ The order of the random numbers decides the pixels: changing it is a new `drawin
 
 from dataclasses import dataclass
 from functools import cache
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import cv2
 import numpy as np
 
-from mfvpr.datasets.streets.camera import LANE, Camera, Facade
-from mfvpr.datasets.streets.sheets import (
-    DARK,
-    WEATHERS,
-    Color,
-    Panel,
-    Prop,
-    Rng,
-    Sheet,
-    Texture,
-    Weather,
-    blotches,
-    tone,
-)
+from mfvpr.datasets.streets.sheets import WEATHERS, Color, Panel, Prop, Rng, Sheet, Texture, Weather, blotches, tone
 
 
 def colors(text: str) -> tuple[Color, ...]:
@@ -38,6 +25,7 @@ ROOFS = colors("9e523e 844a3e 5c5c66 70544c")
 CARS = colors("ba2c28 284882 e4e4e2 3c4046 969ca0 406854 d6b246")
 GLASS, WARM = colors("3e4c5c ffc46e")
 
+LANE = 1.8  # x of the driving lane, meters
 LAMP_SPACING = 22.0  # meters
 NUM_CARS = 24
 CLOUDS = {weather: place for place, weather in enumerate(WEATHERS.values())}  # seeds of the clouds of each weather
@@ -47,40 +35,29 @@ TRAFFIC = ((LANE, 7, 25, 0), (-LANE, 5, 22, 1), (-LANE, 25, 50, 1), (4.0, 5, 18,
 Car = tuple[Prop, Prop]  # a car with its middle at x = 0 and its near end at z = 0: seen from behind, and oncoming
 
 
-class Motif(NamedTuple):
-    """A window type, shared by many houses: size in meters, panes, ornaments."""
+class Facade(NamedTuple):
+    """The street side of a house, in meters: the plane x = `x` between two z, up to `height`."""
 
-    width: float
+    x: float
+    start: float
+    end: float
     height: float
-    columns: int
-    rows: int
-    ornament: str
 
 
+# Window types, shared by many houses: width and height in meters, columns and rows of panes, ornament.
 MOTIFS = (
-    Motif(1.0, 1.6, 2, 3, "shutters"),
-    Motif(1.1, 1.7, 2, 2, "arch"),
-    Motif(1.7, 1.4, 3, 1, "lintel"),
-    Motif(1.1, 2.1, 2, 3, "railing"),
-    Motif(1.2, 1.5, 2, 4, "lintel"),
+    (1.0, 1.6, 2, 3, "shutters"),
+    (1.1, 1.7, 2, 2, "arch"),
+    (1.7, 1.4, 3, 1, "lintel"),
+    (1.1, 2.1, 2, 3, "railing"),
+    (1.2, 1.5, 2, 4, "lintel"),
 )
 
-
-class Body(NamedTuple):
-    """Shape of a car, in meters: heights of hood and roof; where glass and roof start, from the rear and the front."""
-
-    length: float
-    width: float
-    hood: float
-    roof: float
-    rear: tuple[float, float]
-    front: tuple[float, float]
-
-
+# Shapes of cars, in meters: length, width, heights of hood and roof; where glass and roof start, from rear and front.
 BODIES = (
-    Body(4.3, 1.75, 0.92, 1.45, (0.15, 0.7), (1.3, 2.1)),
-    Body(4.6, 1.8, 0.95, 1.42, (0.7, 1.3), (1.3, 2.1)),
-    Body(5.4, 2.0, 1.15, 2.5, (0.02, 0.06), (0.8, 1.5)),
+    (4.3, 1.75, 0.92, 1.45, (0.15, 0.7), (1.3, 2.1)),
+    (4.6, 1.8, 0.95, 1.42, (0.7, 1.3), (1.3, 2.1)),
+    (5.4, 2.0, 1.15, 2.5, (0.02, 0.06), (0.8, 1.5)),
 )
 
 
@@ -110,8 +87,8 @@ def build_scene(seed: int, length: float) -> Scene:
     )
 
 
-def pick(rng: Rng, colors: tuple[Color, ...]) -> Color:
-    return colors[int(rng.integers(len(colors)))]
+def pick(rng: Rng, values: tuple[Any, ...]) -> Any:
+    return values[int(rng.integers(len(values)))]
 
 
 def lamp_light(z: np.ndarray) -> np.ndarray:
@@ -123,7 +100,10 @@ def build_row(seed: int, side: int, length: float) -> tuple[list[Prop], list[Fac
     """The houses of one side of the street (-1: left, 1: right), now and then with a garden in between."""
     rng = np.random.default_rng([seed, 1, side + 1])
     # Both sides take turns through the same few designs, so that the street looks alike every 35 m or so.
-    designs = [Design(np.random.default_rng([seed, 0, index])) for index in range(4)]
+    designs = []  # window type, width in meters, floors above the ground floor, whether there is a shop
+    for index in range(4):
+        draw = np.random.default_rng([seed, 0, index])
+        designs.append((pick(draw, MOTIFS), draw.uniform(6.0, 11.0), int(draw.integers(1, 4)), draw.random() < 0.5))
     props, facades, z = [], [], 2.0
     while z < length:
         if rng.random() < 0.2:
@@ -139,23 +119,13 @@ def build_row(seed: int, side: int, length: float) -> tuple[list[Prop], list[Fac
         prop, facade = build_house(rng, design, side, rng.choice((7.4, 7.9, 8.4, 9.4)), z)
         props.append(prop)
         facades.append(facade)
-        z += design.width
+        z = facade.end
     return props, facades
 
 
-class Design:
-    """Design that several houses share: width in meters, floors above the ground floor, windows, use."""
-
-    def __init__(self, rng: Rng) -> None:
-        self.motif = MOTIFS[int(rng.integers(len(MOTIFS)))]
-        self.width, self.floors = rng.uniform(6.0, 11.0), int(rng.integers(1, 4))
-        self.shop = bool(rng.random() < 0.5)
-
-
-def build_house(rng: Rng, design: Design, side: int, x: float, z: float) -> tuple[Prop, Facade]:
+def build_house(rng: Rng, design: tuple, side: int, x: float, z: float) -> tuple[Prop, Facade]:
     """A house whose facade stands at side * x (side -1: left) from z onwards, in meters."""
-    width, depth, rise = design.width, 9.0, rng.uniform(1.8, 3.4)
-    wall = pick(rng, WALLS)
+    width, depth, rise, wall = design[1], 9.0, rng.uniform(1.8, 3.4), pick(rng, WALLS)
     sheet = draw_facade(rng, wall, design)
     height = sheet.height
     along = np.linspace(z, z + width, sheet.day.shape[1])[::-side]
@@ -179,13 +149,29 @@ def build_house(rng: Rng, design: Design, side: int, x: float, z: float) -> tupl
     return Prop(z + width / 2, (gable, roof, facade)), Facade(inner, z, z + width, height)
 
 
-def draw_facade(rng: Rng, wall: Color, design: Design) -> Sheet:
+def draw_facade(rng: Rng, wall: Color, design: tuple) -> Sheet:
     """The street side of a house: a ground floor of 3.6 m, more floors of 3 m each, a cornice."""
     trim, accent = pick(rng, TRIMS), pick(rng, ACCENTS)
-    width, floors, motif = design.width, design.floors, design.motif
+    motif, width, floors, is_shop = design
     sheet = Sheet(width, 4.1 + 3.0 * floors, wall)
     draw_wall(sheet, rng)
-    draw_damage(sheet, rng)
+    # Marks that tell walls apart: flaked plaster with bare bricks, posters, scribbles.
+    for _ in range(rng.integers(10, 22)):
+        x, y = rng.uniform((0.3, 0.5), (sheet.width - 0.3, sheet.height - 0.5))
+        angles = np.linspace(0, 2 * np.pi, 11)
+        radii = rng.uniform(0.4, 1.0, 11) * rng.uniform(0.12, 0.45)
+        flake = np.stack([x + radii * np.cos(angles), y + 0.7 * radii * np.sin(angles)], 1)
+        sheet.polygon(flake, pick(rng, ((150, 96, 80), (196, 186, 170), (110, 100, 96))))
+    for _ in range(rng.integers(2, 6)):
+        x, y = rng.uniform(0.2, sheet.width - 1.2), sheet.height - rng.uniform(2.0, 2.6)
+        w, h = rng.uniform(0.5, 1.0), rng.uniform(0.8, 1.3)
+        sheet.rect(x, y, w, h, pick(rng, (*ACCENTS, *TRIMS)))
+        for _ in range(4):
+            sheet.polygon(rng.uniform(0.05, 0.95, (3, 2)) * (w, h) + (x, y), pick(rng, (*ACCENTS, *WALLS)))
+        sheet.glyphs(rng, x + 0.08, y + 0.72 * h, w - 0.16, 0.2 * h, (30, 30, 34))
+    if rng.random() < 0.5:
+        start = (rng.uniform(0.5, sheet.width - 1.5), sheet.height - 1.4)
+        sheet.glyphs(rng, *start, 1.5, rng.uniform(0.4, 0.8), pick(rng, ACCENTS))
     bays = int(width // 2.4)
     middles = (np.arange(bays) + 0.5) * width / bays
     for floor in range(floors):
@@ -193,7 +179,7 @@ def draw_facade(rng: Rng, wall: Color, design: Design) -> Sheet:
             draw_window(sheet, rng, float(x), 1.1 + 3.0 * floor, motif, trim, accent)
     top = 0.5 + 3.0 * floors
     sheet.rect(0, top - 0.1, width, 0.18, trim, snow=180)
-    if design.shop:  # a sign, an awning and a display window
+    if is_shop:  # a sign, an awning and a display window
         sheet.rect(0.3, top + 0.2, width - 0.6, 0.75, accent, tone(accent, 0.9))
         sheet.glyphs(rng, 0.6, top + 0.32, rng.uniform(0.5, 1.0) * (width - 1.2), 0.5, trim)
         sheet.rect(0.5, top + 1.1, width - 2.2, 2.1, (54, 52, 54), tone(WARM, 0.85))
@@ -230,52 +216,32 @@ def draw_wall(sheet: Sheet, rng: Rng) -> None:
     sheet.shade(((1 + fine + patches + streaks) * foot)[..., None])
 
 
-def draw_damage(sheet: Sheet, rng: Rng) -> None:
-    """Marks that tell walls apart: flaked plaster with bare bricks, posters, scribbles."""
-    for _ in range(rng.integers(10, 22)):
-        x, y = rng.uniform((0.3, 0.5), (sheet.width - 0.3, sheet.height - 0.5))
-        angles = np.linspace(0, 2 * np.pi, 11)
-        radii = rng.uniform(0.4, 1.0, 11) * rng.uniform(0.12, 0.45)
-        flake = np.stack([x + radii * np.cos(angles), y + 0.7 * radii * np.sin(angles)], 1)
-        sheet.polygon(flake, pick(rng, ((150, 96, 80), (196, 186, 170), (110, 100, 96))))
-    for _ in range(rng.integers(2, 6)):
-        x, y = rng.uniform(0.2, sheet.width - 1.2), sheet.height - rng.uniform(2.0, 2.6)
-        w, h = rng.uniform(0.5, 1.0), rng.uniform(0.8, 1.3)
-        sheet.rect(x, y, w, h, pick(rng, (*ACCENTS, *TRIMS)))
-        for _ in range(4):
-            sheet.polygon(rng.uniform(0.05, 0.95, (3, 2)) * (w, h) + (x, y), pick(rng, (*ACCENTS, *WALLS)))
-        sheet.glyphs(rng, x + 0.08, y + 0.72 * h, w - 0.16, 0.2 * h, (30, 30, 34))
-    if rng.random() < 0.5:
-        start = (rng.uniform(0.5, sheet.width - 1.5), sheet.height - 1.4)
-        sheet.glyphs(rng, *start, 1.5, rng.uniform(0.4, 0.8), pick(rng, ACCENTS))
-
-
-def draw_window(sheet: Sheet, rng: Rng, x: float, y: float, motif: Motif, trim: Color, accent: Color) -> None:
+def draw_window(sheet: Sheet, rng: Rng, x: float, y: float, motif: tuple, trim: Color, accent: Color) -> None:
     """One window with its middle at x and its upper edge at y; one in four is lit at night."""
-    w, h = motif.width, motif.height
+    w, h, columns, rows, ornament = motif
     left = x - w / 2
-    glow = tone(WARM, rng.uniform(0.6, 1.0)) if rng.random() < 0.25 else DARK
-    if motif.ornament == "arch":
+    glow = tone(WARM, rng.uniform(0.6, 1.0)) if rng.random() < 0.25 else (0, 0, 0)
+    if ornament == "arch":
         sheet.ellipse(x, y, w / 2 + 0.1, 0.45, trim)
         sheet.ellipse(x, y, w / 2, 0.35, GLASS, glow)
-    sheet.rect(left - 0.1, y - 0.1 * (motif.ornament != "arch"), w + 0.2, h + 0.2, trim)
+    sheet.rect(left - 0.1, y - 0.1 * (ornament != "arch"), w + 0.2, h + 0.2, trim)
     sheet.rect(left, y, w, h, tone(GLASS, rng.uniform(0.7, 1.5)), glow)
     for side in (0, 1):  # curtains, each drawn a different way
         cloth = rng.uniform(0.05, 0.35) * w
         sheet.rect(left + side * (w - cloth), y, cloth, h * rng.uniform(0.5, 1), (198, 190, 178), tone(glow, 0.7))
-    for column in range(1, motif.columns):
-        sheet.rect(left + w * column / motif.columns - 0.03, y, 0.06, h, trim)
-    for row in range(1, motif.rows):
-        sheet.rect(left, y + h * row / motif.rows - 0.03, w, 0.06, trim)
+    for column in range(1, columns):
+        sheet.rect(left + w * column / columns - 0.03, y, 0.06, h, trim)
+    for row in range(1, rows):
+        sheet.rect(left, y + h * row / rows - 0.03, w, 0.06, trim)
     sheet.rect(left - 0.2, y + h + 0.08, w + 0.4, 0.12, tone(trim, 0.85), snow=240)
-    if motif.ornament == "shutters":
+    if ornament == "shutters":
         for x in (left - 0.6, left + w + 0.1):
             sheet.rect(x, y - 0.05, 0.5, h + 0.1, accent)
             for slat in np.arange(0.12, h, 0.2):
                 sheet.rect(x + 0.08, y + slat, 0.34, 0.06, tone(accent, 0.65))
-    elif motif.ornament == "lintel":
+    elif ornament == "lintel":
         sheet.rect(left - 0.25, y - 0.32, w + 0.5, 0.16, trim, snow=200)
-    elif motif.ornament == "railing":
+    elif ornament == "railing":
         for x in np.arange(left - 0.15, left + w + 0.2, 0.14):
             sheet.rect(x, y + h - 0.9, 0.04, 0.9, (40, 40, 44))
         sheet.rect(left - 0.2, y + h - 0.95, w + 0.4, 0.07, (40, 40, 44), snow=220)
@@ -303,7 +269,7 @@ def build_tree(rng: Rng, x: float, z: float) -> Prop:
 
 def build_furniture(seed: int, length: float) -> list[Prop]:
     """Lamps, trees and signs along both sidewalks."""
-    rng, iron = np.random.default_rng([seed, 2]), (52, 58, 56)
+    rng, iron, red, white = np.random.default_rng([seed, 2]), (52, 58, 56), (186, 40, 36), (240, 238, 232)
     lamp = Sheet(1.0, 5.2, None)
     lamp.rect(0.44, 0.6, 0.12, 4.6, iron)
     lamp.rect(0.38, 4.3, 0.24, 0.9, iron)
@@ -317,25 +283,19 @@ def build_furniture(seed: int, length: float) -> list[Prop]:
             if kind < 0.35:
                 props.append(build_tree(rng, side * 5.6, z + rng.uniform(-2, 2)))
             elif kind < 0.75:
-                sign = draw_sign(rng)
+                sign, kind = Sheet(0.9, 2.9, None), rng.integers(3)
+                sign.rect(0.41, 0.4, 0.08, 2.5, (120, 122, 124))
+                if kind == 0:
+                    sign.ellipse(0.45, 0.45, 0.42, 0.42, red)
+                    sign.ellipse(0.45, 0.45, 0.32, 0.32, white)
+                elif kind == 1:
+                    sign.polygon([(0.0, 0.85), (0.9, 0.85), (0.45, 0.05)], red)
+                    sign.polygon([(0.16, 0.76), (0.74, 0.76), (0.45, 0.25)], white)
+                else:
+                    sign.rect(0.05, 0.05, 0.8, 0.8, (36, 78, 150))
+                sign.glyphs(rng, 0.3, 0.32, 0.4, 0.36, (30, 30, 34) if kind < 2 else white)
                 props.append(Prop.upright(sign.texture(), side * 4.9, z + rng.uniform(-3, 3), 0.9, 2.9))
     return props
-
-
-def draw_sign(rng: Rng) -> Sheet:
-    """A traffic sign on its post: a red circle, a red triangle, or a blue square."""
-    sheet, red, white, kind = Sheet(0.9, 2.9, None), (186, 40, 36), (240, 238, 232), rng.integers(3)
-    sheet.rect(0.41, 0.4, 0.08, 2.5, (120, 122, 124))
-    if kind == 0:
-        sheet.ellipse(0.45, 0.45, 0.42, 0.42, red)
-        sheet.ellipse(0.45, 0.45, 0.32, 0.32, white)
-    elif kind == 1:
-        sheet.polygon([(0.0, 0.85), (0.9, 0.85), (0.45, 0.05)], red)
-        sheet.polygon([(0.16, 0.76), (0.74, 0.76), (0.45, 0.25)], white)
-    else:
-        sheet.rect(0.05, 0.05, 0.8, 0.8, (36, 78, 150))
-    sheet.glyphs(rng, 0.3, 0.32, 0.4, 0.36, (30, 30, 34) if kind < 2 else white)
-    return sheet
 
 
 def build_ground(rng: Rng, z: float) -> Prop:
@@ -384,74 +344,65 @@ def draw_sky(rng: Rng, weather: Weather) -> np.ndarray:
     return np.dstack([np.clip(sky, 0, 255).astype(np.uint8), np.full(shape, 255, np.uint8)])
 
 
-def traffic(cars: tuple[Car, ...], camera: Camera, rng: Rng) -> list[Prop]:
-    """Cars ahead, oncoming cars and parked cars around the camera."""
+def traffic(cars: tuple[Car, ...], z: float, rng: Rng) -> list[Prop]:
+    """Cars ahead, oncoming cars and parked cars around a camera at z."""
     props = []
     for x, nearest, farthest, oncoming in TRAFFIC:
         car = cars[int(rng.integers(len(cars)))]
         if rng.random() < 0.7:
-            x, z = x + rng.uniform(-0.2, 0.2), camera.z + rng.uniform(nearest, farthest)
-            props.append(car[oncoming].move(x, z))
+            props.append(car[oncoming].move(x + rng.uniform(-0.2, 0.2), z + rng.uniform(nearest, farthest)))
     return props
 
 
 def build_car(seed: int, index: int) -> Car:
     """Car number `index` of the street with this seed; panels that face away are included, but never painted."""
     rng = np.random.default_rng([seed, 4, index])
-    body, paint = BODIES[int(rng.choice(3, p=(0.4, 0.35, 0.25)))], pick(rng, CARS)
-    right = draw_side(rng, body, paint).texture()
-    width, length, x = body.width, body.length, -body.width / 2
+    length, width, hood, roof, rear, front = BODIES[int(rng.choice(3, p=(0.4, 0.35, 0.25)))]
+    paint, waist, x = pick(rng, CARS), roof - hood, -width / 2
+    side = Sheet(length, roof, None)  # the right one
+    (low, high), nose, brow = rear, length - front[0], length - front[1]
+    side.polygon([(low, waist), (high, 0), (brow, 0), (nose, waist)], tone(paint, 0.9), snow=90)
+    side.rect(0, waist, length, hood - 0.22, paint)
+    if roof < 2:
+        inner = [(low + 0.25, waist), (high + 0.08, 0.1), (brow - 0.05, 0.1), (nose - 0.2, waist)]
+        side.polygon(inner, (44, 54, 64))
+        side.rect(length * 0.48, 0.1, 0.08, waist, paint)
+    else:
+        side.glyphs(rng, 0.5, 0.5, 2.6, 0.7, pick(rng, ACCENTS))
+        side.polygon([(brow - 1.0, 0.3), (brow, 0.3), (nose - 0.2, waist), (brow - 1.0, waist)], (44, 54, 64))
+    side.rect(0, roof - 0.4, length, 0.12, tone(paint, 0.6))
+    for wheel in (0.85, length - 0.85):
+        side.ellipse(wheel, roof - 0.33, 0.33, 0.33, (30, 30, 32))
+        side.ellipse(wheel, roof - 0.33, 0.18, 0.18, (170, 172, 176))
     shadow, top = Sheet(2.0, 2.0, None), Sheet(1.0, 1.0, tone(paint, 1.1))
     shadow.ellipse(1.0, 1.0, 1.0, 1.0, (66, 66, 70), snow=60)
     top.effects[..., 3] = 235
-    glass = Sheet(width, body.roof - body.hood, paint)  # rear window or windshield with its frame
+    glass = Sheet(width, waist, paint)  # rear window or windshield with its frame
     glass.rect(0.12, 0.08, width - 0.24, min(0.8, glass.height - 0.12), (48, 58, 68))
-    ground, cover, window = shadow.texture(), top.texture(), glass.texture()
+    ground, cover, window, right = shadow.texture(), top.texture(), glass.texture(), side.texture()
 
     def left(weather: Weather) -> np.ndarray:
         return right(weather)[:, ::-1]
 
     views = []
     for near, far, lights, glow, sides in (  # from behind, and from the front
-        (body.rear, body.front, (160, 30, 30), (255, 50, 40), (left, right)),
-        (body.front, body.rear, (236, 236, 228), (255, 250, 230), (right, left)),
+        (rear, front, (160, 30, 30), (255, 50, 40), (left, right)),
+        (front, rear, (236, 236, 228), (255, 250, 230), (right, left)),
     ):
-        end = Sheet(width, body.hood - 0.2, tone(paint, 0.94))  # below the glass, with lights and plate
+        end = Sheet(width, hood - 0.2, tone(paint, 0.94))  # below the glass, with lights and plate
         end.rect(0, end.height - 0.22, width, 0.22, (48, 48, 52))
         end.rect(width / 2 - 0.28, 0.32, 0.56, 0.14, (236, 232, 214))
         for place in (0.08, width - 0.4):
             end.rect(place, 0.12, 0.32, 0.18, lights, glow)
-        roof, across = length - far[1], (width, 0, 0)
+        back, across = length - far[1], (width, 0, 0)
         panels = (
             Panel(ground, (x - 0.25, 0, length + 0.3), (width + 0.5, 0, 0), (0, 0, -length - 0.5)),
-            Panel(cover, (x, -body.hood, length), across, (0, 0, -length)),
-            Panel(end.texture(), (x, -body.hood, 0), across, (0, body.hood - 0.2, 0)),
-            Panel(cover, (x, -body.roof, roof), across, (0, 0, near[1] - roof)),
-            Panel(window, (x, -body.roof, near[1]), across, (0, body.roof - body.hood, near[0] - near[1])),
-            Panel(sides[0], (x, -body.roof, length), (0, 0, -length), (0, body.roof, 0)),
-            Panel(sides[1], (-x, -body.roof, 0), (0, 0, length), (0, body.roof, 0)),
+            Panel(cover, (x, -hood, length), across, (0, 0, -length)),
+            Panel(end.texture(), (x, -hood, 0), across, (0, hood - 0.2, 0)),
+            Panel(cover, (x, -roof, back), across, (0, 0, near[1] - back)),
+            Panel(window, (x, -roof, near[1]), across, (0, waist, near[0] - near[1])),
+            Panel(sides[0], (x, -roof, length), (0, 0, -length), (0, roof, 0)),
+            Panel(sides[1], (-x, -roof, 0), (0, 0, length), (0, roof, 0)),
         )
         views.append(Prop(length / 2, panels))
     return views[0], views[1]
-
-
-def draw_side(rng: Rng, body: Body, paint: Color) -> Sheet:
-    """The right side of a car, which drives to the right."""
-    sheet = Sheet(body.length, body.roof, None)
-    length, waist = body.length, body.roof - body.hood
-    low, high = body.rear
-    nose, brow = length - body.front[0], length - body.front[1]
-    sheet.polygon([(low, waist), (high, 0), (brow, 0), (nose, waist)], tone(paint, 0.9), snow=90)
-    sheet.rect(0, waist, length, body.hood - 0.22, paint)
-    if body.roof < 2:
-        inner = [(low + 0.25, waist), (high + 0.08, 0.1), (brow - 0.05, 0.1), (nose - 0.2, waist)]
-        sheet.polygon(inner, (44, 54, 64))
-        sheet.rect(length * 0.48, 0.1, 0.08, waist, paint)
-    else:
-        sheet.glyphs(rng, 0.5, 0.5, 2.6, 0.7, pick(rng, ACCENTS))
-        sheet.polygon([(brow - 1.0, 0.3), (brow, 0.3), (nose - 0.2, waist), (brow - 1.0, waist)], (44, 54, 64))
-    sheet.rect(0, body.roof - 0.4, length, 0.12, tone(paint, 0.6))
-    for x in (0.85, length - 0.85):
-        sheet.ellipse(x, body.roof - 0.33, 0.33, 0.33, (30, 30, 32))
-        sheet.ellipse(x, body.roof - 0.33, 0.18, 0.18, (170, 172, 176))
-    return sheet

@@ -20,16 +20,14 @@ DARK = (0, 0, 0)
 
 
 def tone(color: Color, gain: float) -> Color:
-    """The color, lighter or darker."""
     return tuple(min(255, int(c * gain)) for c in color)
 
 
 @dataclass(frozen=True)
 class Weather:
-    """All settings of the drawing that depend on hour and season; colors are RGB gains or RGB values 0..255.
+    """All settings of the drawing that depend on hour and season.
 
-    Effects are in px of an image 448 px wide; 0 leaves an effect out. Some grow with the frame's `severity`, which is
-    heavy-tailed: see `expose`.
+    Effects are in px of an image 448 px wide. Some grow with the frame's heavy-tailed `severity`, see `expose`.
     """
 
     ambient: tuple[float, float, float]  # gain on the day colors
@@ -104,13 +102,11 @@ class Sheet:
             self.day[:] = (*color, 255)
 
     def rect(self, x: float, y: float, w: float, h: float, color: Color, glow: Color = DARK, snow: int = 0) -> None:
-        """A rectangle of w by h meters with its upper left corner at (x, y)."""
         x0, y0, x1, y1 = (max(0, round(a * self.scale)) for a in (x, y, x + w, y + h))
         self.day[y0:y1, x0:x1] = (*color, 255)
         self.effects[y0:y1, x0:x1] = (*glow, snow)
 
     def polygon(self, points: ArrayLike, color: Color, glow: Color = DARK, snow: int = 0) -> None:
-        """A filled polygon with corners `[n, 2]`."""
         corners = [np.rint(np.asarray(points, float) * self.scale * 16).astype(np.int32)]
         cv2.fillPoly(self.day, corners, (*color, 255), shift=4)
         cv2.fillPoly(self.effects, corners, (*glow, snow), shift=4)
@@ -118,7 +114,6 @@ class Sheet:
     def ellipse(
         self, x: float, y: float, rx: float, ry: float, color: Color, glow: Color = DARK, snow: int = 0
     ) -> None:
-        """An ellipse around (x, y) with half axes rx and ry."""
         angles = np.linspace(0, 2 * np.pi, 20, endpoint=False)
         points = np.stack([x + rx * np.cos(angles), y + ry * np.sin(angles)], 1)
         self.polygon(points, color, glow, snow)
@@ -129,7 +124,6 @@ class Sheet:
         cv2.polylines(self.day, [corners], False, (*color, 255), max(1, round(width * self.scale)), shift=4)
 
     def shade(self, gain: Floats) -> None:
-        """Multiply the colors by `gain`, broadcast over rows, columns and channels."""
         self.day[..., :3] = np.clip(self.day[..., :3] * gain, 0, 255)
 
     def glyphs(self, rng: Rng, x: float, y: float, width: float, height: float, color: Color) -> None:
@@ -189,6 +183,5 @@ class Prop:
         return cls(z, (Panel(texture, (x - width / 2, -height, z), (width, 0, 0), (0, height, 0)),))
 
     def move(self, x: float, z: float) -> "Prop":
-        """The prop, moved along the ground by x and z meters."""
         panels = (replace(p, corner=(p.corner[0] + x, p.corner[1], p.corner[2] + z)) for p in self.panels)
         return Prop(self.z + z, tuple(panels))

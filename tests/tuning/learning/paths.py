@@ -26,7 +26,7 @@ def path(*, sizes=SIZES, only_right=(), seed=0):
         for query in range(QUERIES)
     ]  # fmt: skip
     apart = np.abs(np.arange(QUERIES)[:, None] - np.arange(QUERIES))
-    positives = [Positives.from_matrix(apart <= tolerance) for tolerance in TOLERANCES]
+    positives = [Positives(apart <= tolerance) for tolerance in TOLERANCES]
     protocol = EvaluationProtocol(TOLERANCES, "frames", positives, positives[-1], halves(positives[-1]), split="both")
     return protocol, match_set_of(pairs, 16), candidates
 
