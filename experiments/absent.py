@@ -17,7 +17,7 @@ from mfvpr.cli.programs import Parser, run_command
 from mfvpr.datasets.datasets import folder
 from mfvpr.evaluation import Confidence, confidence_inputs, fit_confidence, rank_dataset
 from mfvpr.evaluation.confidence import reliability
-from mfvpr.localization.map import fit_on_drive
+from mfvpr.localization.map_settings import fit_on_drive
 from mfvpr.storage import FeatureCache
 
 SURE = 0.8  # confidence from which on a prediction is taken for an answer

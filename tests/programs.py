@@ -95,19 +95,20 @@ def typed(monkeypatch, capsys, program, *arguments):
     monkeypatch.setattr(sys, "argv", [program, *command, *map(str, arguments)])
     monkeypatch.setenv("HYDRA_FULL_ERROR", "1")
     monkeypatch.setattr(logging, "shutdown", lambda *_: None)  # Hydra's call would close an earlier test's stderr
-    handler, code = signal.getsignal(signal.SIGTERM), 0
+    handlers, code = {each: signal.getsignal(each) for each in (signal.SIGINT, signal.SIGTERM)}, 0
     capsys.readouterr()
     try:
         if program in programs.COMMANDS:
             programs.run(program)
         elif program == "paper":
-            launch("paper")
+            launch("paper", "experiments.paper.program:paper")
         else:
             import_module(f"experiments.{program}").main()
     except SystemExit as left:
         code = left.code
     finally:
-        signal.signal(signal.SIGTERM, handler)
+        for each, handler in handlers.items():
+            signal.signal(each, handler)
     return code, *capsys.readouterr()
 
 

@@ -4,7 +4,6 @@ A network is a function of its weights and of RGB images `[B, 3, H, W]`, 0 .. 25
 convolutions use `grid_sample`.
 """
 
-import re
 from collections.abc import Callable, Iterable, Mapping
 from functools import cache
 from typing import Any, NamedTuple
@@ -25,10 +24,10 @@ def torch_weights(arrays: Mapping[str, np.ndarray], table: Table, device: str, l
 
     @cache
     def weight(key: str) -> Tensor:
-        rule, match = next((rule, match) for rule in table.rules if (match := re.fullmatch(rule.source, key)))
-        array = arrays[match.expand(rule.target)]
-        if rule.axes:
-            array = array.reshape(array.shape[-len(rule.axes) :]).transpose(np.argsort(rule.axes))
+        path = table.path_of(key, arrays)
+        array = arrays[path]
+        if axes := table.axes_of(path, array.ndim):
+            array = array.transpose(np.argsort(axes))
         tensor = torch.from_numpy(np.array(array)).to(device)
         return tensor.contiguous(memory_format=layout) if tensor.ndim == 4 else tensor
 

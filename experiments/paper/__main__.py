@@ -3,4 +3,4 @@
 from mfvpr.cli.programs import launch
 
 if __name__ == "__main__":
-    launch("paper")
+    launch("paper", "experiments.paper.program:paper")

@@ -22,7 +22,7 @@ from mfvpr.features import PatchNetVladFeatures, SelaVprFeatures
 from mfvpr.features.whitening import WindowExtractor
 from mfvpr.report.rendering import PAGE
 from mfvpr.report.run_files import ground_truth, write_run_folder
-from mfvpr.report.runs import LAST, write_json
+from mfvpr.report.runs import LAST, write_about, write_json, writing
 from mfvpr.retrieval import fit_to_database
 from mfvpr.storage import FeatureCache
 from mfvpr.systems import assembly
@@ -102,18 +102,16 @@ def evaluate(settings: Evaluate, inputs: Mapping[str, str]) -> None:
     """Evaluate into the run folder, without a table in the terminal."""
     with jobs.claim(settings.out, settings.dataset["name"], own=True) as folder:
         outcome = evaluation.evaluation_of(settings)
-
-        def write(new: Path) -> None:
+        with writing(folder) as new:
             write_run_folder(new, outcome.report, outcome.description)
             write_json(new / INPUTS, dict(inputs))
             write_json(new / SIZES, bytes_of_an_image(outcome.inputs))
             jobs.draw_figures(new, outcome.figures)  # before results.json, after which the run counts as finished
-
-        jobs.write_files(folder, settings, ground_truth(outcome.report, outcome.description), write)
+            write_about(new, to_values(settings), ground_truth(outcome.report, outcome.description), settings.command)
     jax.clear_caches()  # other data sets need other programs, and each program takes memory maps
 
 
-def bytes_of_an_image(inputs: Inputs) -> dict[str, float]:
+def bytes_of_an_image(inputs: Inputs[Evaluate]) -> dict[str, float]:
     """Average bytes in float32 of what was already extracted: `local` features, and the `descriptor` of retrieval.
 
     They are counted as in the paper: with detected keypoints, without those of a grid.

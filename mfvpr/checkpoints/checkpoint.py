@@ -38,7 +38,7 @@ def read_checkpoint(path: Path | str) -> dict[str, np.ndarray]:
         for magic, read in _READERS.items():
             if start.startswith(magic):
                 return read(file)
-        kind = "an empty file" if not start else "a text file, perhaps a web page" if start.isascii() else "another"
+        kind = "an empty or text file, perhaps a web page" if start.isascii() else "another file"
         raise InputError(f"expected a checkpoint of torch, NumPy or MATLAB, got {kind}; download it again")
 
 
@@ -58,16 +58,7 @@ def _read_layers(file: BinaryIO) -> dict[str, np.ndarray]:
 
 
 _WRAPPERS = ("model", "state_dict", "model_state_dict")
-_CODES = {  # NumPy's types of weights, then of counters
-    "FloatStorage": "f4",
-    "DoubleStorage": "f8",
-    "LongStorage": "i8",
-    "IntStorage": "i4",
-    "ShortStorage": "i2",
-    "CharStorage": "i1",
-    "ByteStorage": "u1",
-    "BoolStorage": "?",
-}
+_CODES = dict(Float="f4", Double="f8", Long="i8", Int="i4", Short="i2", Char="i1", Byte="u1", Bool="?")  # of storages
 _MAGIC, _PROTOCOL = 0x1950A86A20F9469CFC6C, 1001  # the start of files from before torch 1.6, which are not zip files
 
 
@@ -94,18 +85,9 @@ class _TensorUnpickler(DataUnpickler):
         "torch._utils._rebuild_tensor_v2": Function(_view),
         "torch._utils._rebuild_parameter": Function(lambda tensor, *_: tensor),
         "argparse.Namespace": _Dictionary,  # itself, since a pickle makes its instances without a call
-        **dict.fromkeys(
-            (
-                "collections.OrderedDict",
-                "_codecs.encode",
-                "numpy.dtype",
-                "numpy.core.multiarray.scalar",
-                "numpy._core.multiarray.scalar",
-            ),
-            Function(_Dictionary),
-        ),
-        **{f"torch.{kind}": code for kind, code in _CODES.items()},
-        **{f"torch.storage.{kind}": code for kind, code in _CODES.items()},
+        **dict.fromkeys(("collections.OrderedDict", "_codecs.encode", "numpy.dtype"), Function(_Dictionary)),
+        **{f"numpy.{core}.multiarray.scalar": Function(_Dictionary) for core in ("core", "_core")},
+        **{f"torch.{part}{kind}Storage": code for part in ("", "storage.") for kind, code in _CODES.items()},
     }
 
     def __init__(self, file: BinaryIO) -> None:

@@ -1,15 +1,12 @@
-"""Convert the tensors of published checkpoints to the parameters of our networks, by one table of keys per network.
+"""Convert the tensors of published checkpoints to the parameters of our networks, by one table of names per network.
 
 The conversion is strict: each key is used once or listed as ignored, each parameter is set once, and all types and
 shapes are checked.
 """
 
 import re
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, field
-from functools import partial
-from itertools import chain
-from typing import NamedTuple
 
 import numpy as np
 
@@ -17,31 +14,52 @@ from mfvpr.io.containers import shorten
 from mfvpr.utils.errors import InputError
 
 # Axes of the source in our order.
-CONV = (2, 3, 1, 0)  # OIHW -> HWIO
 UPSAMPLING = (2, 3, 0, 1)  # a transposed convolution's IOHW -> HWIO
 LINEAR = (1, 0)  # (out, in) -> (in, out), also of 1 x 1 convolutions
-
-
-class Rule(NamedTuple):
-    """Assign keys that fully match `source`, a regular expression, to `target`, a dotted path with its groups.
-
-    `change` is applied first, then the order of `axes`. Axes of length 1 do not count.
-    """
-
-    source: str
-    target: str
-    axes: tuple[int, ...] = ()
-    change: Callable[[np.ndarray], np.ndarray] = np.asarray
+_OF_KERNELS = {4: (2, 3, 1, 0), 2: LINEAR}  # by the number of our axes; OIHW -> HWIO
+_PARAMETERS = {  # theirs -> ours, the first one that the module has
+    "weight": ("kernel", "scale"),
+    "weights": ("kernel",),
+    "bias": ("bias",),
+    "running_mean": ("mean",),
+    "running_var": ("var",),
+    "0": ("kernel",),  # MATLAB's cells
+    "1": ("bias",),
+}
 
 
 @dataclass(frozen=True)
 class Table:
-    """Rules for all keys of a network's checkpoint."""
+    """Names of a network's checkpoint, by regular expressions that match in full.
 
-    rules: tuple[Rule, ...]
-    ignored: tuple[str, ...] = ()  # patterns of keys that the network does not need
-    # Pattern -> required shape of ignored keys that identify this network's checkpoint.
-    expected: Mapping[str, tuple[int, ...]] = field(default_factory=dict)
+    Attributes:
+        names: modules, or whole keys -> our dotted paths, with the groups of the expression.
+        ignored: keys that the network does not need -> their shapes if these identify the checkpoint, or None.
+        axes: our paths -> order of the source's axes; by default, kernels have PyTorch's layout.
+        changes: our paths -> function of the tensor, before its axes are ordered.
+    """
+
+    names: Mapping[str, str]
+    ignored: Mapping[str, tuple[int, ...] | None] = field(default_factory=dict)
+    axes: Mapping[str, tuple[int, ...]] = field(default_factory=dict)
+    changes: Mapping[str, Callable[[np.ndarray], np.ndarray]] = field(default_factory=dict)
+
+    def path_of(self, key: str, paths: Collection[str]) -> str:
+        """The one of these paths that a key of the checkpoint sets; "" if there is none."""
+        module, _, name = key.rpartition(".")
+        forms = [(key, ""), *((module, f".{ours}") for ours in _PARAMETERS.get(name, ()))]
+        for pattern, target in self.names.items():
+            for form, ending in forms:
+                if (match := re.fullmatch(pattern, form)) and (path := match.expand(target) + ending) in paths:
+                    return path
+        return ""
+
+    def axes_of(self, path: str, num_axes: int) -> tuple[int, ...]:
+        """Axes of the source in the order of the parameter's; () = they have the same order."""
+        for pattern, axes in self.axes.items():
+            if re.fullmatch(pattern, path):
+                return axes
+        return _OF_KERNELS[num_axes] if path.endswith(".kernel") else ()
 
 
 def convert(
@@ -57,32 +75,31 @@ def convert(
     parameters: dict[str, np.ndarray] = {}
     problems: list[str] = []
     for key, value in source.items():
-        if any(re.fullmatch(pattern, key) for pattern in table.ignored):
-            for pattern, shape in table.expected.items():
-                if re.fullmatch(pattern, key) and value.shape != shape:
-                    problems.append(f"{key} of another shape: expected {shape}, got {value.shape}")
+        ignored = [shape for pattern, shape in table.ignored.items() if re.fullmatch(pattern, key)]
+        if ignored or key.endswith(".num_batches_tracked"):
+            if any(shape not in (None, value.shape) for shape in ignored):
+                problems.append(f"{key} of another shape: expected {ignored[0]}, got {value.shape}")
             continue
-        rules = [(match, rule) for rule in table.rules if (match := re.fullmatch(rule.source, key))]
-        target = rules[0][0].expand(rules[0][1].target) if len(rules) == 1 else ""
-        if target not in shapes or target in parameters:
-            problems.append(f"{shorten(key)} {'twice' if target in parameters else 'unknown'}")
+        path = table.path_of(key, shapes)
+        if not path or path in parameters:
+            problems.append(f"{shorten(key)} {'twice' if path else 'unknown'}")
             continue
-        parameters[target], problem = _convert_tensor(value, rules[0][1], shapes[target])
+        parameters[path], problem = _convert_tensor(value, table, path, shapes[path])
         problems += [f"{key} {problem}"] if problem else []
-    problems += [f"{target} missing" for target in shapes if target not in parameters]
+    problems += [f"{path} missing" for path in shapes if path not in parameters]
     if problems:
         raise InputError(f"keys do not fit the network in {len(problems)} places: {'; '.join(problems[:3])}")
     return parameters
 
 
-def _convert_tensor(value: np.ndarray, rule: Rule, shape: tuple[int, ...]) -> tuple[np.ndarray, str]:
-    """The parameter of this shape, and what does not fit in a tensor."""
+def _convert_tensor(value: np.ndarray, table: Table, path: str, shape: tuple[int, ...]) -> tuple[np.ndarray, str]:
+    """The parameter of this shape, and what does not fit in a tensor; axes of length 1 do not count."""
     if value.dtype not in (np.float32, np.float64):
         return value, f"of another type: expected float32 or float64, got {value.dtype}"
     try:
-        ordered = rule.change(value)
-        if rule.axes:
-            ordered = ordered.reshape(ordered.shape[: len(rule.axes)]).transpose(rule.axes)
+        ordered = table.changes.get(path, np.asarray)(value)
+        if axes := table.axes_of(path, len(shape)):
+            ordered = ordered.reshape(ordered.shape[: len(axes)]).transpose(axes)
         if [side for side in ordered.shape if side != 1] == [side for side in shape if side != 1]:
             return np.array(ordered, np.float32, order="C").reshape(shape), ""
     except (ValueError, IndexError):  # another number of axes
@@ -90,191 +107,151 @@ def _convert_tensor(value: np.ndarray, rule: Rule, shape: tuple[int, ...]) -> tu
     return value, f"of another shape: {value.shape} does not give {shape}"
 
 
-_COUNTERS = r".*\.num_batches_tracked"
-
-
-def _linear(source: str, target: str, axes: tuple[int, ...] = LINEAR) -> tuple[Rule, ...]:
-    return Rule(rf"{source}\.weight", f"{target}.kernel", axes), Rule(rf"{source}\.bias", f"{target}.bias")
-
-
-_convolution = partial(_linear, axes=CONV)
-
-
-def _norm(source: str, target: str) -> tuple[Rule, ...]:
-    return Rule(rf"{source}\.weight", f"{target}.scale"), Rule(rf"{source}\.bias", f"{target}.bias")
-
-
-def _batch_norm(source: str, target: str) -> tuple[Rule, ...]:
-    statistics = {"running_mean": "mean", "running_var": "var"}
-    rules = (Rule(rf"{source}\.{theirs}", f"{target}.{ours}") for theirs, ours in statistics.items())
-    return *_norm(source, target), *rules
-
+RUNTIME = Table({"(.*)": r"\1"}, axes={".*": ()})  # runtime files have the networks' paths and layouts
 
 _VGG_POSITIONS = (0, 2, 5, 7, 10, 12, 14, 17, 19, 21, 24, 26, 28)  # in the public Sequential, with pooling and ReLU
 _VGG_NAMES = [f"conv{block}_{place + 1}" for block, count in enumerate((2, 2, 3, 3, 3), 1) for place in range(count)]
-_VGG = dict(zip(_VGG_POSITIONS, _VGG_NAMES, strict=True))
 
 
-def _vgg(source: str, target: str = "vgg") -> tuple[Rule, ...]:
-    layers = (_convolution(rf"{source}\.{position}", f"{target}.{name}") for position, name in _VGG.items())
-    return tuple(chain.from_iterable(layers))
+def _vgg(source: str, target: str = "vgg") -> dict[str, str]:
+    places = zip(_VGG_POSITIONS, _VGG_NAMES, strict=True)
+    return {rf"{source}\.{position}": f"{target}.{name}" for position, name in places}
 
 
 D2NET = Table(_vgg(r"dense_feature_extraction\.model"))
 
 SSM = Table(
-    (Rule(r"(conv\d_\d)\.weights", r"vgg.\1.kernel", CONV), Rule(r"(conv\d_\d)\.bias", r"vgg.\1.bias")),
-    ignored=(r"(conv5_3|fc[678]\w*)\.(weights|bias)",),  # layers behind the last map
-    expected={r"fc8\w*\.weights": (365, 4096)},  # ImageNet's networks have 1000 classes
+    {r"(conv\d_\d)": r"vgg.\1"},
+    ignored={  # layers behind the last map; ImageNet's networks have 1000 classes
+        r"fc8\w*\.weights": (365, 4096),
+        r"(conv5_3|fc[678]\w*)\.(weights|bias)": None,
+    },
 )
 
 
-def _resnet(conv1: str, bn1: str, layers: Mapping[str, str]) -> tuple[Rule, ...]:
-    """Rules of a backbone; `layers` maps the file's names of layers to ours."""
-    rules = [Rule(rf"{conv1}\.weight", "backbone.conv1.kernel", CONV), *_batch_norm(bn1, "backbone.bn1")]
-    for source, layer in layers.items():
-        block, ours = rf"{source}\.(\d)", rf"backbone.{layer}.\1"
-        rules += [
-            Rule(rf"{block}\.(conv\d)\.weight", rf"{ours}.\2.kernel", CONV),
-            *_batch_norm(rf"{block}\.(bn\d)", rf"{ours}.\2"),
-            Rule(rf"{block}\.downsample\.0\.weight", f"{ours}.shortcut.kernel", CONV),
-            *_batch_norm(rf"{block}\.downsample\.1", f"{ours}.shortcut_bn"),
-        ]
-    return tuple(rules)
+def _resnet(source: str, numbers: Sequence[int]) -> dict[str, str]:
+    """Layers by their numbers in the file."""
+    names = {}
+    for layer, number in enumerate(numbers, 1):
+        block, ours = rf"{source}{number}\.(\d)", rf"backbone.layer{layer}.\1"
+        names[rf"{block}\.((?:conv|bn)\d)"] = rf"{ours}.\2"
+        names |= {rf"{block}\.downsample\.0": f"{ours}.shortcut", rf"{block}\.downsample\.1": f"{ours}.shortcut_bn"}
+    return names
 
 
 MIXVPR = Table(
-    (
-        *_resnet(
-            r"backbone\.model\.conv1",
-            r"backbone\.model\.bn1",
-            {rf"backbone\.model\.layer{number}": f"layer{number}" for number in (1, 2, 3)},
-        ),
-        *_norm(r"aggregator\.mix\.(\d)\.mix\.0", r"mix.\1.norm"),
-        *_linear(r"aggregator\.mix\.(\d)\.mix\.1", r"mix.\1.linear1"),
-        *_linear(r"aggregator\.mix\.(\d)\.mix\.3", r"mix.\1.linear2"),
-        *_linear(r"aggregator\.channel_proj", "channel_proj"),
-        *_linear(r"aggregator\.row_proj", "row_proj"),
-    ),
-    ignored=(_COUNTERS,),
+    {
+        r"backbone\.model\.(conv1|bn1)": r"backbone.\1",
+        **_resnet(r"backbone\.model\.layer", (1, 2, 3)),
+        r"aggregator\.mix\.(\d)\.mix\.0": r"mix.\1.norm",
+        r"aggregator\.mix\.(\d)\.mix\.1": r"mix.\1.linear1",
+        r"aggregator\.mix\.(\d)\.mix\.3": r"mix.\1.linear2",
+        r"aggregator\.(channel_proj|row_proj)": r"\1",
+    }
 )
-
-_CONV = r"(block\d\.conv\d|conv\d)"
 
 ALIKED = Table(
-    (
-        Rule(rf"{_CONV}\.weight", r"\1.kernel", CONV),
-        Rule(r"(block\d\.conv\d)\.regular_conv\.weight", r"\1.kernel", CONV),  # the deformable convolution's
-        *_convolution(r"(block\d\.conv\d)\.offset_conv", r"\1.offset"),
-        *_batch_norm(r"(block\d\.bn\d)", r"\1"),
-        *_convolution(r"(block\d)\.downsample", r"\1.shortcut"),
-        *(
-            Rule(rf"score_head\.{position}\.weight", f"score_head.{place}.kernel", CONV)
-            for place, position in enumerate((0, 2, 4, 6))
-        ),
-        Rule(r"desc_head\.agg_weights", "desc_head.agg_weights"),
-        *_convolution(r"desc_head\.offset_conv\.0", "desc_head.offset1"),
-        *_convolution(r"desc_head\.offset_conv\.2", "desc_head.offset2"),
-        Rule(r"desc_head\.sf_conv\.weight", "desc_head.sample.kernel", CONV),
-    ),
-    ignored=(_COUNTERS,),
+    {
+        r"(block\d\.conv\d|conv\d)": r"\1",
+        r"(block\d\.conv\d)\.regular_conv": r"\1",  # the deformable convolution's
+        r"(block\d\.conv\d)\.offset_conv": r"\1.offset",
+        r"(block\d\.bn\d)": r"\1",
+        r"(block\d)\.downsample": r"\1.shortcut",
+        **{rf"score_head\.{2 * place}": f"score_head.{place}" for place in range(4)},
+        r"desc_head\.agg_weights": "desc_head.agg_weights",
+        r"desc_head\.offset_conv\.0": "desc_head.offset1",
+        r"desc_head\.offset_conv\.2": "desc_head.offset2",
+        r"desc_head\.sf_conv": "desc_head.sample",
+    }
 )
 
-_LAYER = r"(?:transformers\.(\d)\.{0}_attn|{0}_attn\.(\d))"  # the second form in older files; one group is empty
 
-
-def _attention(source: str, target: str, parts: dict[str, str]) -> tuple[Rule, ...]:
-    layer, ours = _LAYER.format(source), rf"layers.\1\2.{target}"
-    parts = parts | {r"ffn\.0": "hidden", r"ffn\.3": "update"}
-    linear = (_linear(rf"{layer}\.{theirs}", f"{ours}.{name}") for theirs, name in parts.items())
-    return *chain.from_iterable(linear), *_norm(rf"{layer}\.ffn\.1", f"{ours}.norm")
+def _attention(source: str, target: str, parts: dict[str, str]) -> dict[str, str]:
+    layer = rf"(?:transformers\.(\d)\.{source}_attn|{source}_attn\.(\d))"  # the second form in older files
+    parts = parts | {r"ffn\.0": "hidden", r"ffn\.1": "norm", r"ffn\.3": "update"}
+    return {rf"{layer}\.{theirs}": rf"layers.\1\2.{target}.{ours}" for theirs, ours in parts.items()}
 
 
 LIGHTGLUE = Table(
-    (
-        *_linear("input_proj", "input"),
-        Rule(r"posenc\.Wr\.weight", "position.kernel", LINEAR),
-        *_attention("self", "within", {"Wqkv": "inputs.0", "out_proj": "message"}),
-        *_attention("cross", "across", {"to_qk": "inputs.0", "to_v": "inputs.1", "to_out": "message"}),
-        *_linear(r"log_assignment\.(\d)\.final_proj", r"layers.\1.projection"),
-        *_linear(r"log_assignment\.(\d)\.matchability", r"layers.\1.matchability"),
-        *_linear(r"token_confidence\.(\d)\.token\.0", r"confidences.\1"),
-    ),
-    ignored=("confidence_thresholds",),  # computed from the number of layers
+    {
+        "input_proj": "input",
+        r"posenc\.Wr": "position",
+        **_attention("self", "within", {"Wqkv": "inputs.0", "out_proj": "message"}),
+        **_attention("cross", "across", {"to_qk": "inputs.0", "to_v": "inputs.1", "to_out": "message"}),
+        r"log_assignment\.(\d)\.final_proj": r"layers.\1.projection",
+        r"log_assignment\.(\d)\.matchability": r"layers.\1.matchability",
+        r"token_confidence\.(\d)\.token\.0": r"confidences.\1",
+    },
+    ignored={"confidence_thresholds": None},  # computed from the number of layers
 )
 
 # Patch-NetVLAD, and pytorch-NetVlad without the projection; training on several devices adds `module`.
 NETVLAD = Table(
-    (
-        *_vgg(r"encoder(?:\.module)?"),
-        Rule(r"pool(?:\.module)?\.conv\.weight", "pool.assignment.kernel", LINEAR),
-        Rule(r"pool(?:\.module)?\.centroids", "pool.centers"),
-        *_linear(r"WPCA\.0", "projection"),
-    )
+    {
+        **_vgg(r"encoder(?:\.module)?"),
+        r"pool(?:\.module)?\.conv": "pool.assignment",
+        r"pool(?:\.module)?\.centroids": "pool.centers",
+        r"WPCA\.0": "projection",
+    }
 )
 
 # Layers of the original, with MATLAB's axes: height, width, inputs, outputs. The centers have the opposite sign.
 NETVLAD_MATLAB = Table(
-    (
-        *(
-            Rule(rf"net\.layers\.{position}\.weights\.{place}", f"vgg.{name}.{part}")
-            for position, name in _VGG.items()
-            for place, part in enumerate(("kernel", "bias"))
-        ),
-        Rule(r"net\.layers\.30\.weights\.0", "pool.assignment.kernel"),
-        Rule(r"net\.layers\.30\.weights\.1", "pool.centers", LINEAR, np.negative),
-        Rule(r"net\.layers\.33\.weights\.0", "projection.kernel"),
-        Rule(r"net\.layers\.33\.weights\.1", "projection.bias"),
-        Rule(r"net\.meta\.normalization\.averageImage", "average", change=lambda image: image[0, 0]),
-    ),
-    ignored=(r"net\.(?!layers\.\d+\.weights|meta\.normalization\.averageImage).*",),  # settings of the training
+    {
+        **{f"{layer}\\.weights": name for layer, name in _vgg(r"net\.layers").items()},
+        r"net\.layers\.30\.weights\.0": "pool.assignment.kernel",
+        r"net\.layers\.30\.weights\.1": "pool.centers",
+        r"net\.layers\.33\.weights": "projection",
+        r"net\.meta\.normalization\.averageImage": "average",
+    },
+    ignored={r"net\.(?!layers\.\d+\.weights|meta\.normalization\.averageImage).*": None},  # of the training
+    axes={r"pool\.centers": LINEAR, ".*": ()},
+    changes={"pool.centers": np.negative, "average": lambda image: image[0, 0]},
 )
 
-_GEM = (Rule(r"aggregation\.1\.p", "pool.power"), *_linear(r"aggregation\.3", "projection"))
-GEM_VGG16 = Table((*_vgg("backbone", "backbone"), *_GEM))
+_GEM = {r"aggregation\.1\.p": "pool.power", r"aggregation\.3": "projection"}
+GEM_VGG16 = Table(_vgg("backbone", "backbone") | _GEM)
 GEM_RESNET50 = Table(
-    (
-        *_resnet(
-            r"backbone\.0", r"backbone\.1", {rf"backbone\.{place}": f"layer{place - 3}" for place in (4, 5, 6, 7)}
-        ),
-        *_GEM,
-    ),
-    ignored=(_COUNTERS,),
+    {
+        r"backbone\.0": "backbone.conv1",
+        r"backbone\.1": "backbone.bn1",
+        **_resnet(r"backbone\.", (4, 5, 6, 7)),
+        **_GEM,
+    }
 )
 
 
-def _transformer(source: str, target: str) -> tuple[Rule, ...]:
+def _transformer(source: str, target: str) -> dict[str, str]:
     block, ours = rf"{source}blocks\.(\d+)", rf"{target}blocks.\1"
-    return (
-        Rule(rf"{source}cls_token", f"{target}first"),
-        Rule(rf"{source}pos_embed", f"{target}positions"),
-        Rule(rf"{source}register_tokens", f"{target}registers"),
-        *_convolution(rf"{source}patch_embed\.proj", f"{target}patches"),
-        *_linear(rf"{block}\.attn\.qkv", f"{ours}.attention.qkv"),
-        *_linear(rf"{block}\.attn\.proj", f"{ours}.attention.output"),
-        *_linear(rf"{block}\.mlp\.fc1", f"{ours}.perceptron.hidden"),
-        *_linear(rf"{block}\.mlp\.fc2", f"{ours}.perceptron.output"),
-        Rule(rf"{block}\.ls(\d)\.gamma", rf"{ours}.scale\2"),
-        *_norm(rf"{block}\.norm(\d)", rf"{ours}.norm\2"),
-        *_norm(rf"{source}norm", f"{target}norm"),
-    )
+    return {
+        rf"{source}cls_token": f"{target}first",
+        rf"{source}pos_embed": f"{target}positions",
+        rf"{source}register_tokens": f"{target}registers",
+        rf"{source}patch_embed\.proj": f"{target}patches",
+        rf"{block}\.attn\.qkv": f"{ours}.attention.qkv",
+        rf"{block}\.attn\.proj": f"{ours}.attention.output",
+        rf"{block}\.mlp\.fc1": f"{ours}.perceptron.hidden",
+        rf"{block}\.mlp\.fc2": f"{ours}.perceptron.output",
+        rf"{block}\.ls(\d)\.gamma": rf"{ours}.scale\2",
+        rf"{block}\.norm(\d)": rf"{ours}.norm\2",
+        rf"{source}norm": f"{target}norm",
+    }
 
 
-_MASK = "mask_token"  # of the training
-
-DINOV2 = Table(_transformer("", ""), ignored=(_MASK,))
+DINOV2 = Table(_transformer("", ""), ignored={"mask_token": None})  # of the training
 
 # Training on several devices puts `module` before all keys.
-_SELA, _BLOCK = r"(?:module\.)?", r"backbone\.blocks\.(\d+)"
+_SELA, _BLOCK = r"(?:module\.)?", r"(?:module\.)?backbone\.blocks\.(\d+)"
 SELAVPR = Table(
-    (
-        *_transformer(rf"{_SELA}backbone\.", "backbone."),
-        *_linear(rf"{_SELA}{_BLOCK}\.adapter1\.D_fc1", r"backbone.blocks.\1.serial.hidden"),
-        *_linear(rf"{_SELA}{_BLOCK}\.adapter1\.D_fc2", r"backbone.blocks.\1.serial.output"),
-        *_linear(rf"{_SELA}{_BLOCK}\.adapter2\.D_fc1", r"backbone.blocks.\1.parallel.hidden"),
-        *_linear(rf"{_SELA}{_BLOCK}\.adapter2\.D_fc2", r"backbone.blocks.\1.parallel.output"),
-        Rule(rf"{_SELA}aggregation\.1\.p", "pool.power"),
-        *_linear(rf"{_SELA}LocalAdapt\.upconv(\d)", r"upsampling\1", UPSAMPLING),
-    ),
-    ignored=(rf"{_SELA}backbone\.{_MASK}",),
+    {
+        **_transformer(rf"{_SELA}backbone\.", "backbone."),
+        rf"{_BLOCK}\.adapter1\.D_fc1": r"backbone.blocks.\1.serial.hidden",
+        rf"{_BLOCK}\.adapter1\.D_fc2": r"backbone.blocks.\1.serial.output",
+        rf"{_BLOCK}\.adapter2\.D_fc1": r"backbone.blocks.\1.parallel.hidden",
+        rf"{_BLOCK}\.adapter2\.D_fc2": r"backbone.blocks.\1.parallel.output",
+        rf"{_SELA}aggregation\.1\.p": "pool.power",
+        rf"{_SELA}LocalAdapt\.upconv(\d)": r"upsampling\1",
+    },
+    ignored={rf"{_SELA}backbone\.mask_token": None},
+    axes={r"upsampling\d\.kernel": UPSAMPLING},
 )

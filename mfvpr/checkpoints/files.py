@@ -12,17 +12,8 @@ import numpy as np
 import safetensors.numpy
 
 from mfvpr.checkpoints.checkpoint import read_checkpoint
-from mfvpr.checkpoints.conversion import convert
-from mfvpr.checkpoints.networks import (
-    NETWORKS,
-    OWN,
-    RUNTIME,
-    Entry,
-    blueprint,
-    entry_of,
-    how_to_install,
-    own_entry,
-)
+from mfvpr.checkpoints.conversion import RUNTIME, convert
+from mfvpr.checkpoints.networks import NETWORKS, OWN, Entry, blueprint, entry_of, how_to_install, own_entry
 from mfvpr.io.containers import reading
 from mfvpr.utils.errors import InputError
 from mfvpr.utils.files import replacing, require_file
@@ -59,40 +50,42 @@ def install(checkpoint: Path, name: str, *, own: str | None = None) -> Path:
         entry = own_entry(f"{OWN}{own}", name)
         if is_installed(entry):
             raise InputError(f"{entry.name}: expected a name that is free, got one of installed weights")
+    sha256 = check_sha256(checkpoint, entry, checkpoint)
     if own is not None and checkpoint.suffix == ".safetensors":
         with reading(checkpoint, "a safetensors file"):
             table, tensors = RUNTIME, _read(checkpoint)[1]
     else:
-        check_sha256(checkpoint, entry, checkpoint)
         tensors = read_checkpoint(checkpoint)
     plan = blueprint(entry)
     try:
         arrays = convert(tensors, table, plan.shapes)
     except InputError as error:
         raise InputError(f"{checkpoint}: {error}; {mend}") from error
-    return save(entry, arrays, checkpoint, parameters=plan.parameters)
+    return save(entry, arrays, checkpoint, parameters=plan.parameters, sha256=sha256)
 
 
-def check_sha256(file: Path, entry: Entry, origin: object) -> None:
-    """Raise an InputError that begins with `origin` if a file has another hash than the published one."""
-    if entry.sha256 is not None and (sha256 := file_sha256(file)) != entry.sha256:
+def check_sha256(file: Path, entry: Entry, origin: object) -> str:
+    """The hash of a file; an InputError that begins with `origin` if another one is published."""
+    sha256 = file_sha256(file)
+    if entry.sha256 not in (None, sha256):
         expected, mend = f"the sha256 of {entry.name}, {entry.sha256[:12]}...", "weights of your own need --own NAME"
         raise InputError(f"{origin}: expected {expected}, got {sha256[:12]}...; {mend}")
+    return sha256
 
 
-def save(entry: Entry, arrays: Mapping[str, np.ndarray], source: Path, *, parameters: int) -> Path:
-    """Write the arrays by dotted path, and where they come from.
+def save(
+    entry: Entry, arrays: Mapping[str, np.ndarray], source: Path, *, parameters: int, sha256: str | None = None
+) -> Path:
+    """Write the arrays by dotted path, and where they come from; an InputError if values are not finite.
 
-    `source` is the checkpoint of the arrays; `parameters` is their number, without running statistics.
-
-    Raises:
-        InputError: values are not finite.
+    `source` is their checkpoint, `sha256` its hash, if it is known; `parameters` is their number, without running
+    statistics.
     """
     for path, array in arrays.items():
         if not np.isfinite(array).all():
             raise InputError(f"{source}: expected finite values, got NaN or infinity in {path}; use the official file")
     provenance = {"name": entry.name, "like": entry.like, "sha256": _digest(arrays), "parameters": parameters}
-    provenance |= {"source_file": source.name, "source_sha256": file_sha256(source)}
+    provenance |= {"source_file": source.name, "source_sha256": sha256 or file_sha256(source)}
     contiguous = {path: np.ascontiguousarray(array) for path, array in arrays.items()}
     with replacing(_path(entry)) as temporary:
         temporary.write_bytes(safetensors.numpy.save(contiguous, {_PROVENANCE: json.dumps(provenance)}))
@@ -102,12 +95,9 @@ def save(entry: Entry, arrays: Mapping[str, np.ndarray], source: Path, *, parame
 def load(name: str) -> dict[str, np.ndarray]:
     """Read arrays by dotted path, and compare them with the hash of their file's metadata.
 
-    Raises:
-        InputError: the name is unknown.
-        WeightsError: the weights are not installed, or the file is damaged or of other weights.
+    An InputError for an unknown name, a WeightsError if they are not installed, damaged or other weights.
     """
-    provenance = read_provenance(name)
-    entry = installed_entry(name)
+    provenance, entry = read_provenance(name), installed_entry(name)
     with suppress(safetensors.SafetensorError):
         arrays = _read(_path(entry))[1]
         if _digest(arrays) == provenance["sha256"]:
@@ -118,9 +108,7 @@ def load(name: str) -> dict[str, np.ndarray]:
 def load_model(name: str) -> "nnx.Module":
     """Load the network of this name with its weights, ready for inference.
 
-    Raises:
-        InputError: the name is unknown.
-        WeightsError: as `load`; or the arrays do not fit the network.
+    An InputError for an unknown name, a WeightsError if the weights are not installed, damaged or other weights.
     """
     entry, arrays = installed_entry(name), load(name)
     try:
@@ -130,11 +118,10 @@ def load_model(name: str) -> "nnx.Module":
 
 
 def read_provenance(name: str) -> dict[str, Any]:
-    """Read the metadata of an installed file, but not its arrays.
+    """Read the metadata of an installed file, but not its arrays; errors are those of `load`.
 
-    They are the `name` of the weights, the `sha256` of the arrays, the number of `parameters` without running
-    statistics, `source_file` and `source_sha256`, and for weights of your own the published weights that they are
-    `like`. Errors are those of `load`.
+    They are `name`, the `sha256` of the arrays, the number of `parameters` without running statistics, `source_file`
+    and `source_sha256`, and for weights of your own the published weights that they are `like`.
     """
     entry = installed_entry(name)
     if not is_installed(entry):
@@ -169,7 +156,7 @@ def is_installed(entry: Entry) -> bool:
 
 def file_sha256(path: Path) -> str:
     """The sha256 of a file of any size; an InputError if it is none, such as a pipe."""
-    require_file(path)
+    require_file(path, "a checkpoint file")
     with path.open("rb") as file:
         return hashlib.file_digest(file, "sha256").hexdigest()
 

@@ -12,14 +12,13 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 
 from mfvpr.checkpoints import conversion
-from mfvpr.checkpoints.conversion import Rule, Table, convert
+from mfvpr.checkpoints.conversion import RUNTIME, Table, convert
 from mfvpr.utils.errors import InputError
 
 if TYPE_CHECKING:
     from flax import nnx
 
 OWN = "own/"  # names of weights of one's own begin with it, also in settings and run folders
-RUNTIME = Table((Rule("(.*)", r"\1"),))  # runtime files have the networks' paths
 
 
 @dataclass(frozen=True)
@@ -113,38 +112,19 @@ for _name, _size, _sha256 in (
     _source = f"https://github.com/Shiaoming/ALIKED/raw/main/models/{_name}.pth"
     _publish("aliked", _name, _source, conversion.ALIKED, "Aliked", _name, size=_size, sha256=_sha256)
 
-_publish(
-    "lightglue",
-    "aliked_lightglue",
-    "https://github.com/cvg/LightGlue/releases/download/v0.1_arxiv/aliked_lightglue.pth",
-    conversion.LIGHTGLUE,
-    "LightGlue",
-    size=47_632_827,
-    sha256="d975e965b105311a6143194852297dff4f02aea5cc2e10cecfed966ca0e22503",
-)
-_publish(
-    "ssm",
-    "vgg16_places365",
-    "https://imr.ciirc.cvut.cz/uploads/Datasets/checkpoints.zip",
-    conversion.SSM,
-    "SsmVgg",
-    file="vgg16_places365.npy",
-)
+_source = "https://github.com/cvg/LightGlue/releases/download/v0.1_arxiv/aliked_lightglue.pth"
+_sha256 = "d975e965b105311a6143194852297dff4f02aea5cc2e10cecfed966ca0e22503"
+_publish("lightglue", "aliked_lightglue", _source, conversion.LIGHTGLUE, "LightGlue", size=47_632_827, sha256=_sha256)
+
+_source = "https://imr.ciirc.cvut.cz/uploads/Datasets/checkpoints.zip"
+_publish("ssm", "vgg16_places365", _source, conversion.SSM, "SsmVgg", file="vgg16_places365.npy")
 
 for _name, _file in (("netvlad_pitts30k", "Pitts30K_struct.mat"), ("netvlad_tokyotm", "TokyoTM_struct.mat")):
     _source = f"https://cvg-data.inf.ethz.ch/hloc/netvlad/{_file}"
     _publish("netvlad", _name, _source, conversion.NETVLAD_MATLAB, "VggNetVlad", 64, 4096, original=True)
-_publish(
-    "netvlad",
-    "netvlad_pytorch",
-    "vgg16_netvlad_checkpoint.zip at https://drive.google.com/open?id=17luTjZFCX639guSVy00OUtzfTQo4AMF2",
-    conversion.NETVLAD,
-    "VggNetVlad",
-    64,
-    None,
-    file="checkpoint.pth.tar",
-    licenses=("none stated", "none stated"),
-)
+_source = "vgg16_netvlad_checkpoint.zip at https://drive.google.com/open?id=17luTjZFCX639guSVy00OUtzfTQo4AMF2"
+_about = {"file": "checkpoint.pth.tar", "licenses": ("none stated", "none stated")}
+_publish("netvlad", "netvlad_pytorch", _source, conversion.NETVLAD, "VggNetVlad", 64, None, **_about)
 
 for _backbone, _outputs, _table in (
     ("VGG16", 512, conversion.GEM_VGG16),
@@ -165,8 +145,8 @@ for _name, _clusters, _outputs, _size, _sha256 in (
     ("landmarks", 64, 4096, None, "659a837b11883ed8a8ea5e1d1a46eb2871ea26514fbfc2ad7d9d4e1334380a34"),
 ):
     _source = f"https://huggingface.co/TobiasRobotics/Patch-NetVLAD/resolve/main/{_name}_WPCA{_outputs}.pth.tar"
-    _model, _file = ("VggNetVlad", _clusters, _outputs), {"size": _size, "sha256": _sha256}
-    _publish("patch_netvlad", f"patchnetvlad_{_name}_{_outputs}", _source, conversion.NETVLAD, *_model, **_file)
+    _model, _about = ("VggNetVlad", _clusters, _outputs), {"size": _size, "sha256": _sha256}
+    _publish("patch_netvlad", f"patchnetvlad_{_name}_{_outputs}", _source, conversion.NETVLAD, *_model, **_about)
 
 for _name, *_sizes in (("vits14", 384, 12, 6), ("vitb14", 768, 12, 12), ("vitl14", 1024, 24, 16)):
     _source = f"https://dl.fbaipublicfiles.com/dinov2/dinov2_{_name}/dinov2_{_name}_pretrain.pth"
@@ -206,13 +186,12 @@ def entry_of(name: str) -> Entry:
     raise InputError(f"{name}: no weights of this name; {hint}")
 
 
-@dataclass(frozen=True)
-class Blueprint:
+class Blueprint(NamedTuple):
     """A network without values, made without computing any."""
 
     shapes: Mapping[str, tuple[int, ...]]  # by dotted path; parameters and running statistics
     parameters: int  # without running statistics
-    _module: "nnx.Module"
+    module: "nnx.Module"
 
     def build(self, arrays: Mapping[str, np.ndarray]) -> "nnx.Module":
         """Build the network with these values, in evaluation mode; InputError if paths or shapes differ."""
@@ -220,7 +199,7 @@ class Blueprint:
         from flax import nnx
 
         arrays = jax.device_put(convert(arrays, RUNTIME, self.shapes))
-        graph, state = nnx.split(self._module)
+        graph, state = nnx.split(self.module)
         leaves = [(keys, leaf.replace(arrays[_path(keys)])) for keys, leaf in nnx.to_flat_state(state)]
         module = nnx.merge(graph, nnx.from_flat_state(leaves))
         module.eval()

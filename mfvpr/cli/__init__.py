@@ -3,7 +3,3 @@
 Read first: programs (the command `mfvpr`), schema (settings of the programs), command_line (Hydra, `load_system`),
 jobs (what jobs share). The jobs are evaluation, sweeping (also `mfvpr.sweep`), learning, localization, commands.
 """
-
-import lazy_loader
-
-__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

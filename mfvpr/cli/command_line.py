@@ -24,6 +24,7 @@ from mfvpr.checkpoints import entry_of, is_installed
 from mfvpr.cli import schema
 from mfvpr.cli.console import explain, one_line, tell, warn
 from mfvpr.evaluation import System
+from mfvpr.io.containers import reading
 from mfvpr.systems import assembly
 from mfvpr.systems.assembly import CONF, without
 from mfvpr.utils.cluster import Cluster
@@ -31,41 +32,34 @@ from mfvpr.utils.errors import InputError
 from mfvpr.utils.fields import from_values
 
 Job = Callable[[Any], None]  # of the settings of its program
-_STEERING_WEIGHTS = "aliked-n16"
 
 
-def run(program: str, find_job: Callable[[], Job], command: str) -> None:
+def run(program: str, find_job: Callable[[], Job]) -> None:
     """Run the job of a program once, or with `--multirun` for each combination of values."""
     os.environ["HYDRA_FULL_ERROR"] = "1"  # Hydra then raises its errors
     warnings.filterwarnings("ignore", "A worker stopped")  # joblib renews a worker that has grown
-    arguments = sys.argv[1:]
     schema.register()
 
     def task(composed: DictConfig) -> None:
-        about = HydraConfig.get()
-        if about.mode != RunMode.MULTIRUN:
-            with one_line():  # in here, or Hydra adds lines to the error
-                run_job(composed, arguments, None)
-            return
-        typed = [*about.overrides.task]
-        tell(f"job {about.job.num}: {' '.join(typed)}")
-        overrides = dict(override.split("=", 1) for override in typed)
-        run_job(composed, typed, {"multirun": about.sweep.dir, "number": about.job.num, "overrides": overrides})
-
-    def run_job(composed: DictConfig, typed: list[str], multirun: dict[str, Any] | None) -> None:
-        settings = checked(program, composed)
-        job = find_job()
-        _set_up_jax(settings.compiled)
-        if not isinstance(settings, schema.Common):
-            job(settings)
-            return
-        shown = shlex.join(argument for argument in typed if not argument.startswith("launcher="))
-        chosen = settings.cluster
-        starts = {"address": Cluster.connect, "local": Cluster.local, "slurm": Cluster.slurm}
-        with starts[chosen["name"]](**without(chosen, "name")) if chosen else nullcontext() as workers:
-            if workers is not None:
-                tell(f"cluster: {workers}")
-            job(replace(settings, command=f"{command} {shown}", multirun=multirun, workers=workers))
+        about, typed, multirun = HydraConfig.get(), sys.argv[1:], None
+        if about.mode == RunMode.MULTIRUN:
+            typed = [*about.overrides.task]
+            overrides = dict(override.split("=", 1) for override in typed)
+            multirun = {"multirun": about.sweep.dir, "number": about.job.num, "overrides": overrides}
+            tell(f"job {about.job.num}: {' '.join(typed)}")
+        with one_line() if multirun is None else nullcontext():  # in here, or Hydra adds lines to the error
+            settings, job = checked(program, composed), find_job()
+            _set_up_jax(settings.compiled)
+            if not isinstance(settings, schema.Common):
+                job(settings)
+                return
+            shown = shlex.join(argument for argument in typed if not argument.startswith("launcher="))
+            chosen = settings.cluster
+            starts = {"address": Cluster.connect, "local": Cluster.local, "slurm": Cluster.slurm}
+            with starts[chosen["name"]](**without(chosen, "name")) if chosen else nullcontext() as workers:
+                if workers is not None:
+                    tell(f"cluster: {workers}")
+                job(replace(settings, command=f"mfvpr {program} {shown}", multirun=multirun, workers=workers))
 
     hydra.main(version_base="1.3", config_path=str(CONF), config_name=program)(task)()
 
@@ -81,9 +75,8 @@ def _set_up_jax(compiled: bool) -> None:
     try:
         jax.devices()
     except (RuntimeError, AssertionError) as error:  # the latter for `cuda` without its plugin
-        platforms, reason = os.environ.get("JAX_PLATFORMS"), " ".join(str(error).split("\n")[:1])
-        expected = f"expected a device that JAX can use here ({reason}); set JAX_PLATFORMS=cpu"
-        raise InputError(f"JAX_PLATFORMS={platforms}: {expected}") from error
+        platforms, reason = os.environ.get("JAX_PLATFORMS"), " ".join(str(error).splitlines()[:1])
+        raise InputError(f"JAX_PLATFORMS={platforms}: expected a device that JAX can use, got: {reason}") from error
 
 
 def checked(program: str, composed: DictConfig) -> Any:
@@ -134,20 +127,14 @@ def load_system(name: str | Path = "mfvpr", **settings: Any) -> System:
             says what was expected.
     """
     if not str(name).endswith(".json"):
-        values: Any = OmegaConf.to_container(
-            compose("evaluate", [*_overrides({"system": str(name)} | settings)]), resolve=True
-        )
+        composed = compose("evaluate", [*_overrides({"system": str(name)} | settings)])
+        values: Any = OmegaConf.to_container(composed, resolve=True)
     elif settings:
         raise InputError(f"{name}: expected no other settings, got {', '.join(settings)}; load a system by name")
     else:
-        try:
+        with reading(Path(name), "the run.json of a run of mfvpr evaluate"):
             values = json.loads(Path(name).read_text(encoding="utf-8"))["settings"]
-            if not {"scorer", "previous_queries"} <= {*values}:
-                raise ValueError("another file")
-        except (OSError, ValueError, LookupError, TypeError) as error:
-            raise InputError(f"{name}: expected the run.json of a run of mfvpr evaluate, got {error}") from error
-    settings_of_run = from_values(schema.Evaluate, values)
-    return assembly.system(settings_of_run, settings_of_run.previous_queries, settings_of_run.sequence)
+    return assembly.system(from_values(schema.Evaluate, values))
 
 
 def override(name: str, value: Any) -> str:
@@ -176,12 +163,9 @@ def _plain(value: Any) -> Any:
 
 def aliked_or_sift() -> str:
     """The features of system=steering: ALIKED if its weights are installed, otherwise SIFT, with a warning."""
-    if is_installed(entry_of(_STEERING_WEIGHTS)):
+    if is_installed(entry_of("aliked-n16")):
         return "aliked"
-    reason = (
-        f"the weights {_STEERING_WEIGHTS} are not installed; with them it is more precise, see `mfvpr weights list`"
-    )
-    warnings.warn(f"system=steering uses SIFT, because {reason}", stacklevel=2)
+    warnings.warn("system=steering uses SIFT, because the weights aliked-n16 are not installed", stacklevel=2)
     return "sift"
 
 

@@ -3,6 +3,7 @@
 import json
 import shlex
 from collections.abc import Sequence
+from functools import partial
 from http.client import HTTPException
 from pathlib import Path
 from typing import Any, Literal
@@ -18,7 +19,7 @@ from mfvpr.checkpoints.networks import how_to_install
 from mfvpr.cli.command_line import compose_data_sets
 from mfvpr.cli.console import progress, refuse, track
 from mfvpr.cli.jobs import dataset_of
-from mfvpr.datasets import Dataset, QuerySequence, image_folder
+from mfvpr.datasets import ImageFolder, image_folder
 from mfvpr.datasets.contents import own_rows
 from mfvpr.datasets.ground_truth import middle, threshold_words
 from mfvpr.datasets.published import PUBLISHED, published_differences
@@ -36,13 +37,11 @@ from mfvpr.utils.files import printable, replacing
 from mfvpr.utils.numerics import available_cpus
 from mfvpr.utils.runtime import ordered_map
 
-_CHUNK = 1 << 18  # bytes
 _UNPUBLISHED = {
     "grief_season": "a park path in summer, and in snow (Krajnik et al., ECMR 2015): database/ and queries/",
     "corridor": "an indoor corridor, 111 + 111 frames, as VPR-Bench has it: ref/ and query/",
     "streets_seasons": "drawn: a street by day, and on seven other days; it needs no folder",
 }
-_TOLERANCE, _RADIUS = 5, 25.0  # frames, meters: the widest that the paper takes
 _CANDIDATES = ("preds", "hloc", "kapture")  # layouts
 
 # --- weights -----------------------------------------------------------------------------------------------------
@@ -112,7 +111,7 @@ def download_weights(name: str) -> None:
         try:
             with replacing(target) as temporary, urlopen(entry.source, timeout=30) as response:
                 with temporary.open("wb") as file, progress(entry.file, total=entry.size) as bar:
-                    while (chunk := response.read(_CHUNK)) and not (entry.size and bar.n > entry.size):
+                    while chunk := response.read(1 << 18):
                         bar.update(file.write(chunk))
                 check_sha256(temporary, entry, entry.source)
         except (OSError, HTTPException) as error:
@@ -129,27 +128,19 @@ def download_weights(name: str) -> None:
 
 def list_data(names: Sequence[str] = ()) -> None:
     """Print a table of all data sets, or details of those that are named."""
-    about = {entry.name: f"{entry.title}\n{entry.layout}\nfrom {entry.source}" for entry in PUBLISHED.values()}
-    for name in names:
-        if name not in (known := about | _UNPUBLISHED):
+    sets = PUBLISHED.values()
+    known = {each.name: f"{each.title}\n{each.layout}\nfrom {each.source}" for each in sets} | _UNPUBLISHED
+    if not names:
+        rows = [[each.name, each.title, f"{each.database:,}", f"{sum(each.queries.values()):,}"] for each in sets]
+        print(Table(["name", "what it is", "database", "queries"], rows, text_columns=2).text(), end="")
+    for name in names or _UNPUBLISHED:
+        if name not in known:
             raise InputError(f"{name}: expected one of {', '.join(known)}")
         print(f"{name}: {known[name]}")
-    if not names:
-        rows = [
-            [entry.name, entry.title, f"{entry.database:,}", f"{sum(entry.queries.values()):,}"]
-            for entry in PUBLISHED.values()
-        ]
-        print(Table(["name", "what it is", "database", "queries"], rows, text_columns=2).text(), end="")
-        print("\n".join(f"{name}: {description}" for name, description in _UNPUBLISHED.items()))
 
 
-def check_data_set(
-    name: str,
-    settings: Sequence[str] = (),
-    *,
-    sheet: Path | None = None,
-) -> None:
-    """Print image counts beside the published ones and the ground truth's extent; draw image pairs.
+def check_data_set(name: str, settings: Sequence[str] = (), *, sheet: Path | None = None) -> None:
+    """Print image counts and the ground truth's extent; draw image pairs; fail if the published counts are others.
 
     `name` is as in dataset=NAME; settings of the data set, such as root=DIR, stand without `dataset.`; `sheet` is where
     pairs are drawn, by default NAME.png.
@@ -158,30 +149,23 @@ def check_data_set(
         raise InputError(f"{wrong[0]}: expected name=value")
     values = {key: yaml.safe_load(value) for key, value in (each.split("=", 1) for each in settings)}
     [chosen] = compose_data_sets([{name: values}])
-    dataset, contents, entry = dataset_of(chosen), FeatureCache(None).recipes.contents, PUBLISHED.get(name)
-    folders = {"database": (dataset.database, entry and entry.database)}
-    for sequence in dataset.sequences:
-        side = f"queries {sequence.name}" if len(dataset.sequences) > 1 else "queries"
-        folders[side] = sequence.images, entry and entry.queries.get(sequence.name)
-    rows, unreadable = [], []
-    for side, (folder, published) in folders.items():
-
-        def read_error(row: int, folder: Any = folder) -> str | None:
-            try:
-                folder.read(row)
-            except InputError as error:
-                return str(error)
-            return None
-
-        reasons = ordered_map(read_error, range(len(folder)), workers=available_cpus())
-        bad = [reason for reason in track(f"reading {side}")(reasons, len(folder)) if reason]
-        rows.append([side, f"{len(folder):,}", "-" if published is None else f"{published:,}", f"{len(bad):,}"])
+    dataset, contents, unreadable = dataset_of(chosen), FeatureCache(None).recipes.contents, list[str]()
+    folders = {"database": dataset.database} | {f"queries {each.name}": each.images for each in dataset.sequences}
+    for side, folder in folders.items():
+        errors = ordered_map(partial(_read_error, folder), range(len(folder)), workers=available_cpus())
+        bad = [error for error in track(f"reading {side}")(errors, len(folder)) if error]
+        print(f"{side}: {len(folder):,} images, {len(bad):,} unreadable")
         unreadable += bad
-    print(Table(["images of", "there", "published", "unreadable"], rows).text())
-    print("".join(f"unreadable: {reason}\n" for reason in unreadable[:10]), end="")
+    for reason in unreadable[:10]:
+        print(f"unreadable: {reason}")
     database = contents(dataset.database)
     for sequence in dataset.sequences:
-        print(f"{sequence.name}: {_truth_in_words(sequence)}")
+        if sequence.truth is not None:
+            *_, threshold = sequence.truth.thresholds()  # the widest
+            counts, within = sequence.truth.positives(threshold).counts, threshold_words(sequence.truth.unit, threshold)
+            extent = f"{counts.min()} to {counts.max()}, median {np.median(counts):g}"
+            none = f"{(counts == 0).sum():,} queries have none"
+            print(f"{sequence.name}: correct images of a query{within}: {extent}; {none}")
         if num_same := sum(map(bool, own_rows(contents(sequence.images), database))):
             print(f"{sequence.name}: {num_same:,} queries are images of the database")
     target = sheet or Path(f"{dataset.name}.png")
@@ -192,16 +176,12 @@ def check_data_set(
         refuse(f"{dataset.name}: {'; '.join(wrong)}")
 
 
-def _truth_in_words(sequence: QuerySequence) -> str:
-    """Extent of a sequence's ground truth."""
-    if sequence.truth is None:
-        return "no ground truth"
-    [threshold] = sequence.truth.thresholds(tolerances=[_TOLERANCE], radius=_RADIUS)
-    counts = sequence.truth.positives(threshold).counts
-    within = threshold_words(sequence.truth.unit, threshold).strip()
-    extent = f"{counts.min()} to {counts.max()}, median {np.median(counts):g}"
-    within = f" ({within})" if within else ""
-    return f"correct images of a query{within}: {extent}; {(counts == 0).sum():,} queries have none"
+def _read_error(folder: ImageFolder, row: int) -> str | None:
+    try:
+        folder.read(row)
+    except InputError as error:
+        return str(error)
+    return None
 
 
 # --- predictions -------------------------------------------------------------------------------------------------
@@ -213,11 +193,10 @@ def write_page(runs: list[Path], *, out: Path | None = None) -> None:
     `out` is by default RUN/report.html of one run, and comparison.html here of several.
     """
     if len(runs) == 1:
-        path = write_report(runs[0], out)
+        out = write_report(runs[0], out)
     else:
-        path = out or Path("comparison.html")
-        write_comparison(runs, path)
-    print(printable(f"report: {path}"))
+        write_comparison(runs, out := out or Path("comparison.html"))
+    print(printable(f"report: {out}"))
 
 
 def convert(
@@ -245,25 +224,21 @@ def convert(
     database: for tum and kitti of mfvpr localize: the folder of the map's images.
     query_prefix, database_prefix: for hloc and kapture: what stands before the names of images, such as queries/.
     """
-    is_run, is_trajectory, prefixes = source.is_dir(), layout in ("tum", "kitti"), (query_prefix, database_prefix)
-    if layout in _CANDIDATES and not is_run:
-        raise InputError(f"{source}: expected the run folder of mfvpr evaluate for --layout {layout}, got no folder")
-    if is_trajectory and (poses is None or (database is None and not is_run)):
+    if layout in ("tum", "kitti") and (poses is None or (database is None and not source.is_dir())):
         missing = "--poses" if poses is None else "--database"
         raise InputError(f"{missing}: expected a path for --layout {layout} of {source}, got none")
-    unused = {
-        "--poses": poses is not None and not is_trajectory,
-        "--times": times is not None and layout not in ("tum", "shifts"),
-        "--database": database is not None and (is_run or not is_trajectory),
-        "--query-prefix, --database-prefix": prefixes != ("", "") and layout not in ("hloc", "kapture"),
-    }
-    if names := [name for name, is_unused in unused.items() if is_unused]:
-        raise InputError(f"{names[0]}: expected none for --layout {layout} of {source}; remove it")
-    if not is_run:
+    if not source.is_dir():
+        if layout in _CANDIDATES:
+            raise InputError(f"{source}: expected the run folder of mfvpr evaluate for --layout {layout}, got a file")
         names = image_folder(database).names if database else ()
         _write_localized(out, layout, prediction_files.read_lines(source), poses, names, times)
         return
-    dataset, thresholds = _dataset_of_run(source)
+    with reading(source / "run.json", mend="expected the folder of an evaluation"):
+        about: Any = json.loads((source / "run.json").read_text("utf-8"))
+        settings, thresholds = about["settings"], about["ground_truth"].get("thresholds", [])
+    if "recall" not in settings:
+        raise InputError(f"{source}: expected a run of mfvpr evaluate, got one of Python; use Result.write_predictions")
+    dataset = dataset_of(settings["dataset"])
     if times and len(dataset.sequences) > 1:
         raise InputError(f"--times: expected one query sequence, got {len(dataset.sequences)}; name images by time")
     names = [sequence.name for sequence in dataset.sequences]
@@ -274,22 +249,12 @@ def convert(
         if layout not in _CANDIDATES:
             _write_localized(target, layout, images, poses, dataset.database.names, times)
             continue
-        shortlist = prediction_files.shortlist_of(images, dataset.database.names)
-        positives = sequence.truth.positives(middle(thresholds)) if sequence.truth and thresholds else None
-        sides = sequence.images, dataset.database
+        shortlist, positives = prediction_files.shortlist_of(images, dataset.database.names), None
+        if sequence.truth and thresholds and settings["dataset"].get("exclude_neighbors") is None:  # else not correct
+            positives = sequence.truth.positives(middle(thresholds))
+        sides, prefixes = (sequence.images, dataset.database), (query_prefix, database_prefix)
         prediction_files.write_candidates(target, shortlist, *sides, layout, positives, prefixes=prefixes)
         print(printable(f"{target}: candidates of {int(shortlist.mask.any(axis=1).sum())} queries"))
-
-
-def _dataset_of_run(folder: Path) -> tuple[Dataset, Sequence[float]]:
-    """The data set of a run, and the thresholds of a correct prediction, if its truth says which images are correct."""
-    with reading(folder / "run.json", mend="expected the folder of an evaluation"):
-        about: Any = json.loads((folder / "run.json").read_text("utf-8"))
-        settings, thresholds = about["settings"]["dataset"], about["ground_truth"].get("thresholds", [])
-        thresholds = [] if settings.get("exclude_neighbors") is not None else thresholds  # they are not correct
-    if "recall" not in about["settings"]:
-        raise InputError(f"{folder}: expected a run of mfvpr evaluate, got one of Python; use Result.write_predictions")
-    return dataset_of(settings), thresholds
 
 
 def _write_localized(

@@ -15,7 +15,6 @@ if TYPE_CHECKING:  # or the command line would wait for JAX
     from mfvpr.utils.runtime import Track
 
 _ERASE = "\r\x1b[K"
-_OTHER_NAMES = {"store": "cache", "fusion.filter_score": "fusion.retrieval_score"}  # of version 0.2.0
 
 
 def tell(text: str) -> None:
@@ -61,8 +60,7 @@ def explain(error: Exception) -> str | None:
     text = " ".join((str(error) or str(error.__cause__)).split())
     for rest in (" Config search path", " See https", " To append to your ", " object_type="):
         text = text.partition(rest)[0]
-    new_names = [f"; its name is {new} now" for old, new in _OTHER_NAMES.items() if f"'{old}'" in text]
-    return text + "".join(new_names)
+    return text
 
 
 def refuse(reason: str) -> NoReturn:

@@ -1,29 +1,29 @@
 """Steps that jobs share: inputs from settings, warnings about them, and the run folder."""
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import ExitStack, contextmanager
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import AbstractContextManager
 from dataclasses import dataclass, replace
 from datetime import datetime
-from itertools import takewhile
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, Generic, TypeVar
 
 from mfvpr import datasets
 from mfvpr.baselines.learned_weight import provenance
 from mfvpr.cli.console import tell, track, warn
 from mfvpr.cli.schema import Common, RecallSettings
 from mfvpr.core.types import Shortlist
-from mfvpr.datasets import Dataset, IndexFile, LabelFiles, QuerySequence
+from mfvpr.datasets import Dataset, IndexFile, LabelFiles
 from mfvpr.datasets.contents import Contents, fingerprints, own_rows
 from mfvpr.datasets.ground_truth import CHOICES, threshold_words
 from mfvpr.datasets.published import published_dataset, published_differences
 from mfvpr.datasets.streets import CONDITIONS, TRUTH, streets_folder
 from mfvpr.evaluation import EvaluationProtocol, Pipeline, evaluation_protocol, match_sequence
-from mfvpr.evaluation.dataset_ranking import matches_recipe, num_candidates
+from mfvpr.evaluation.dataset_ranking import num_candidates
 from mfvpr.evaluation.protocol import Split
 from mfvpr.evaluation.system import folders_of
 from mfvpr.matchers import MatchSet, Scales
-from mfvpr.report import pages, runs
+from mfvpr.report import runs
+from mfvpr.report.run_files import matched_content
 from mfvpr.report.runs import Figure
 from mfvpr.storage import FeatureCache
 from mfvpr.systems import assembly
@@ -34,24 +34,17 @@ from mfvpr.utils.files import expand_user
 
 Job = TypeVar("Job", bound=Common)
 _FILES = {"index_file": "index", "query_labels": "label", "database_labels": "label"}  # and the ground truth in them
-_WORDS = {
-    "order": "file order",
-    "utm": "positions in the names",
-    "drawn": "drawn with the images",
-    "published": "as published",
-}
-# A learned match weight depends on these settings.
-_LEARNED_WITH = {"features": ("name", "weights"), "matching": ("name", "cross_check")}
 
 
 @dataclass(frozen=True)
-class Inputs:
+class Inputs(Generic[Job]):
     """The inputs of a job."""
 
+    settings: Job  # with the image size that `features.image_size=auto` leaves to the images
     dataset: Dataset  # without neighbors of the queries, if the settings exclude them
     contents: Mapping[str, Contents]  # of the image files, by side
     pipeline: Pipeline
-    cache: FeatureCache
+    cache: FeatureCache  # with the watch of the job
     ground_truth: dict[str, Any]  # kind, files, unit and thresholds, as results store them
 
     @property
@@ -59,44 +52,39 @@ class Inputs:
         """Thresholds of a correct prediction, ascending; empty without ground truth."""
         return self.ground_truth.get("thresholds", [])
 
+    @property
+    def about(self) -> dict[str, Any]:
+        """The data set in results."""
+        seen = fingerprints(self.contents)
+        return {"dataset": self.dataset.name, "data_fingerprint": seen, "ground_truth": self.ground_truth}
+
     def protocol(self, split: Split | None) -> EvaluationProtocol:
         """The protocol of rankings for sweeps and learning."""
         if self.dataset.truth is None:
-            expected = "choosing settings needs a ground truth; set order, index, utm or label"
-            raise InputError(f"dataset.ground_truth=none: {expected}")
+            raise InputError("dataset.ground_truth=none: choosing settings needs order, index, utm or label")
         return evaluation_protocol(self.dataset.truth, self.thresholds, split)
 
-    def match(self, watch: Stopwatch) -> tuple[MatchSet | Scales, Shortlist]:
+    def match(self) -> tuple[MatchSet | Scales, Shortlist]:
         """Matches and shortlist of the only sequence, from their store if it has all of them."""
-        result = match_sequence(self.dataset, self.dataset.only, self.pipeline, cache=replace(self.cache, watch=watch))
+        result = match_sequence(self.dataset, self.dataset.only, self.pipeline, cache=self.cache)
         return result.by_scale, result.candidates
 
-    def matches_recipe(self) -> dict[str, Any]:
-        """Recipe of the shortlist and the matches of the only sequence, and of the fusion of several scales."""
-        recipe = matches_recipe(self.dataset, self.dataset.only, self.pipeline, self.cache)
-        scales = self.pipeline.scales
-        return recipe | ({"scale_weights": [scale.weight for scale in scales]} if len(scales) > 1 else {})
 
-
-def with_image_size(settings: Job) -> Job:
-    """The settings with the image size that `features.image_size=auto`, or a number of pixels, leaves to the images."""
-    if isinstance(settings.features["image_size"], list | None):
-        return settings
-    dataset = dataset_of(settings.dataset)
-    size = assembly.pipeline(settings, dataset).size_for_images(folders_of(dataset), warn)
-    return replace(settings, features={**settings.features, "image_size": [*size]})
-
-
-def prepare(settings: Common, watch: Stopwatch) -> Inputs:
+def prepare(settings: Job, watch: Stopwatch) -> Inputs[Job]:
     """The inputs that the settings name; notes and warnings tell what is peculiar about them.
 
     The pipeline comes first, since its errors should come before anything slow, unless it needs files about the images.
     """
-    cache = cache_of(settings)
+    cache = replace(cache_of(settings), watch=watch)
     names = {settings.features["name"], settings.retrieval["name"], settings.matching["name"]}
     pipeline = None if names & {"import", "pairs"} else assembly.pipeline(settings, None)
     with watch("data"):
         dataset, neighbors = dataset_of(settings.dataset), settings.dataset.get("exclude_neighbors")
+        pipeline = pipeline or assembly.pipeline(settings, dataset)
+        if pipeline.pixels is not None:
+            size = pipeline.size_for_images(folders_of(dataset), warn)
+            pipeline = pipeline.with_image_size(size)
+            settings = replace(settings, features={**settings.features, "image_size": [*size]})
         contents, sequences = {"database": cache.recipes.contents(dataset.database)}, []
         for sequence in dataset.sequences:
             side = f"query {sequence.name}" if len(dataset.sequences) > 1 else "query"
@@ -109,7 +97,7 @@ def prepare(settings: Common, watch: Stopwatch) -> Inputs:
         ground_truth = describe_truth(settings.dataset, settings.recall, dataset)
         _warn_of_data(dataset, contents, ground_truth.get("thresholds", []))
         _warn_of_settings(settings, dataset, contents)
-    return Inputs(dataset, contents, pipeline or assembly.pipeline(settings, dataset), cache, ground_truth)
+    return Inputs(settings, dataset, contents, pipeline, cache, ground_truth)
 
 
 def cache_of(settings: Common) -> FeatureCache:
@@ -139,14 +127,10 @@ def dataset_of(settings: Mapping[str, Any]) -> Dataset:
     kind, several = settings["ground_truth"], isinstance(settings["queries"], list)
     if kind is None:
         raise InputError(f"dataset.ground_truth: nothing is assumed of your own images; set it to one of {CHOICES}")
-    if several == ("database_labels" in settings):  # only a single sequence has labels
-        expected = "DIR, or [DIR,...] with dataset=sequences" if several else "[DIR,...], or DIR with dataset=folder"
-        raise InputError(f"dataset.queries: expected {expected}, got {settings['queries']}")
     for name, reader in _FILES.items():
         if (settings.get(name) is not None) != (kind == reader):
-            expected = f"dataset.{name}=FILE" if kind == reader else f"none, or dataset.ground_truth={reader}"
-            got = f"dataset.{name}={settings.get(name)}"
-            raise InputError(f"dataset.ground_truth={kind}: expected {expected}, got {got}")
+            expected = f"dataset.{name}=FILE" if kind == reader else f"no dataset.{name}, which is for {reader}"
+            raise InputError(f"dataset.ground_truth={kind}: expected {expected}")
     truth = kind
     if kind == "index":
         truth = IndexFile(expand_user(settings["index_file"]), settings["widen_index"])
@@ -173,29 +157,39 @@ def describe_truth(choice: Mapping[str, Any], recall: RecallSettings, dataset: D
 
 def truth_in_words(*descriptions: Mapping[str, Any]) -> str:
     """The ground truth in a heading, from descriptions of data sets with the same thresholds."""
-    first, sources = descriptions[0], []
-    if "unit" not in first:
+    if "unit" not in (first := descriptions[0]):
         return "no ground truth: rankings only"
-    for each in descriptions:
-        files = ", ".join(dict.fromkeys(each["files"]))
-        labels = "labels in " if each["kind"] == "label" else ""
-        sources.append(labels + (files or _WORDS.get(each["kind"], each["kind"])))
-    source = ", ".join(dict.fromkeys(sources))
-    if first["unit"] == "exact":
-        return f"recall in %, ground truth: {source}"
     within = ", ".join(f"{threshold:g}" for threshold in first["thresholds"])
-    return f"recall in %, within {within} {first['unit']} of the ground truth: {source}"
+    within = "" if first["unit"] == "exact" else f" within {within} {first['unit']}"
+    sources = [" ".join([each["kind"], *each["files"]]) for each in descriptions]
+    return f"recall in %{within}, ground truth: {', '.join(dict.fromkeys(sources))}"
+
+
+def score_in_words(settings: Common) -> str:
+    """The score, and what its matches are of, in a heading."""
+    return f"{settings.scorer['method']} score, {matched_content(vars(settings))}"
 
 
 # --- notes and warnings ------------------------------------------------------------------------------------------
 
 
 def _warn_of_data(dataset: Dataset, contents: Mapping[str, Contents], thresholds: Sequence[float]) -> None:
-    """Warn of what is peculiar about the images and the ground truth."""
+    """Warn of what is peculiar about the images and the ground truth, such as queries that are database images."""
     for difference in published_differences(dataset):
         warn(f"{dataset.name}: {difference}; its numbers are not comparable")
     for sequence, images in zip(dataset.sequences, [*contents.values()][1:], strict=True):
-        _warn_of_sequence(sequence, sum(map(bool, own_rows(images, contents["database"]))), thresholds)
+        same = sum(map(bool, own_rows(images, contents["database"])))
+        if same and sequence.excluded is None:
+            images_of = f"{same} of {len(sequence.images)} queries are database images"
+            warn(f"{images_of}: each finds itself; set dataset.exclude_neighbors=N, the frames to leave out around it")
+        if (truth := sequence.truth) is None:
+            continue
+        without = [threshold for threshold in thresholds if not truth.positives(threshold).rows.size]
+        if without == thresholds:
+            warn("the ground truth has no correct image for any query; every recall will be 0")
+        elif without:
+            words = ", ".join(threshold_words(truth.unit, threshold).strip() for threshold in without)
+            warn(f"no query has a correct image within {words}; recall will be 0 there; use larger recall.tolerances")
     largest = max(file.largest for images in contents.values() for file in images.files)
     used, bits = max(largest.bit_length(), 8), dataset.database.bits
     if largest and bits is not None and not bits - 1 <= used <= bits:
@@ -203,61 +197,39 @@ def _warn_of_data(dataset: Dataset, contents: Mapping[str, Contents], thresholds
         warn(f"the largest value of all 16-bit images is {largest}: they look {look}; use dataset.bits={used}")
 
 
-def _warn_of_sequence(sequence: QuerySequence, same: int, thresholds: Sequence[float]) -> None:
-    """Warn of queries that are database images, and of thresholds without any correct prediction."""
-    if same and sequence.excluded is None:
-        leave = "set dataset.exclude_neighbors=N to leave out what is within N frames of it (0 = itself alone)"
-        warn(f"{same} of {len(sequence.images)} queries are database images: each finds itself; {leave}")
-    if (truth := sequence.truth) is None:
-        return
-    without = list(takewhile(lambda threshold: not truth.positives(threshold).rows.size, thresholds))
-    if without == thresholds:
-        warn("the ground truth has no correct image for any query; every recall will be 0")
-    elif without:
-        words = ", ".join(threshold_words(truth.unit, threshold).strip() for threshold in without)
-        warn(f"no query has a correct image within {words}; recall will be 0 there; use larger recall.tolerances")
-
-
 def _warn_of_settings(settings: Common, dataset: Dataset, contents: Mapping[str, Contents]) -> None:
     """Warn of fewer candidates than expected, of features that LightGlue may not know, of weights that do not fit."""
-    groups = {"features": settings.features, "matching": settings.matching}
+    features, matching = settings.features, settings.matching
     if settings.retrieval["name"] != "pairs":  # whose numbers of candidates are not known yet
         available, number = num_candidates(settings.candidates, dataset.database), settings.candidates
         if isinstance(number, int) and number > available:
             tell(f"note: candidates={number}, but the database has {available} images; all of them are re-ranked")
         if deeper := [f"R@{k}" for k in settings.recall.ks if k > available]:
             tell(f"note: {', '.join(deeper)} = R@{available}, of retrieval too: no more candidates are looked at")
-    if settings.features["name"] == "import" and settings.matching["name"] == "lightglue":
+    if features["name"] == "import" and matching["name"] == "lightglue":
         warn("matching=lightglue knows ALIKED's features alone; what features=import gives must be these")
     names = {values.get("weight", "fs") for values in assembly.expand_weights(settings.scorer).values()}
     names |= {*(getattr(settings, "grid", {}).get("weight") or ())}  # that a sweep tries
     for name in sorted(names):
         if not (origin := provenance(name)):
             continue
-        sets = origin.get("data_sets", [origin])
-        learned_on = {folder for each in sets for folder in each.get("data_fingerprint", {}).values()}
-        if {*fingerprints(contents).values()} & learned_on:
+        learned_on = [each.get("data_fingerprint", {}).values() for each in origin.get("data_sets", [origin])]
+        if {*fingerprints(contents).values()} & {folder for folders in learned_on for folder in folders}:
             warn(f"weight={name} was learned on images of {dataset.name}, so that it flatters here")
-        for group, keys in _LEARNED_WITH.items():
-            before, now = origin.get("settings", {}).get(group, {}), groups[group]
-            if other := [key for key in keys if before.get(key) != now.get(key)]:
-                words = ", ".join(f"{before.get(key, 'unknown')} instead of {now.get(key)}" for key in other)
+        for group, key in (("features", "weights"), ("matching", "cross_check")):
+            before, now = origin.get("settings", {}).get(group, {}), getattr(settings, group)
+            if other := [each for each in ("name", key) if before.get(each) != now.get(each)]:
+                words = ", ".join(f"{before.get(each, 'unknown')} instead of {now.get(each)}" for each in other)
                 warn(f"weight={name} was learned with other {group} ({words}); it may mean nothing here")
 
 
 # --- the run folder ----------------------------------------------------------------------------------------------
 
 
-@contextmanager
-def claim(out: str | None, dataset: str, **options: Any) -> Iterator[Path]:
-    """The run folder `out`, for this run alone; None = a new one of a data set. Options as of `claim_run_folder`."""
+def claim(out: str | None, dataset: str, *, own: bool = False) -> AbstractContextManager[Path]:
+    """The run folder `out`, for this run alone, see `claim_run_folder`; None = a new one of a data set."""
     folder = expand_user(out) if out else Path("runs", dataset, f"{datetime.now():%Y-%m-%d_%H-%M-%S}")
-    with ExitStack() as stack:
-        try:
-            folder = stack.enter_context(runs.claim_run_folder(folder, numbered=not out, **options))
-        except InputError as error:
-            raise InputError(f"{error} with out=DIR") from error
-        yield folder
+    return runs.claim_run_folder(folder, numbered=not out, own=own)
 
 
 def write_results(
@@ -274,7 +246,9 @@ def write_results(
     The text is printed even if the files cannot be written; `write` gets the folder for them.
     """
     try:
-        write_files(folder, settings, ground_truth, write)
+        with runs.writing(folder) as new:
+            write(new)
+            runs.write_about(new, to_values(settings), ground_truth, settings.command)
     finally:
         print(f"\n{text}", flush=True)
     draw_figures(folder, figures)
@@ -284,17 +258,6 @@ def write_results(
         print(f"jobs: {job['multirun']}")
 
 
-def write_files(folder: Path, settings: Common, ground_truth: Mapping[str, Any], write: Callable[[Path], None]) -> None:
-    """Write the files of a run and run.json; arguments as of `write_results`."""
-    try:
-        with runs.writing(folder) as new:
-            write(new)
-            runs.write_about(new, to_values(settings), ground_truth, settings.command)
-    except OSError as error:
-        reason = f"the results cannot be written ({error.strerror}); they are printed above"
-        raise InputError(f"{folder}: {reason}: make room, or name another folder with out=DIR") from error
-
-
 def draw_figures(folder: Path, figures: Sequence[Figure]) -> None:
     """Draw the figures of a run; warn if one cannot be drawn."""
     for name, draw_figure in track("figures")(figures, len(figures)):
@@ -302,12 +265,3 @@ def draw_figures(folder: Path, figures: Sequence[Figure]) -> None:
             draw_figure(folder / "figures" / name)
         except Exception as error:  # of any kind from Matplotlib; the results are already written
             warn(f"{folder}/figures/{name}: not drawn ({error})")
-
-
-def report_page(folder: Path) -> Path | None:
-    """Write the page of an evaluation and return its path; warn and return None if that fails."""
-    try:
-        return pages.write_report(folder)
-    except (ImportError, InputError, OSError) as error:
-        warn(f"{folder}: no page was made of it ({error})")
-        return None

@@ -12,14 +12,13 @@ from mfvpr.baselines.learned_weight import ABSOLUTE, RELATIVE
 from mfvpr.cli import jobs
 from mfvpr.cli.command_line import compose_data_sets
 from mfvpr.cli.console import warn
-from mfvpr.cli.jobs import cache_of, prepare, truth_in_words, with_image_size
+from mfvpr.cli.jobs import Inputs, prepare, score_in_words, truth_in_words
 from mfvpr.cli.schema import Learn
 from mfvpr.cli.sweeping import axes_of
-from mfvpr.datasets.contents import Contents, fingerprints, own_rows
-from mfvpr.evaluation.protocol import Split
+from mfvpr.datasets.contents import own_rows
+from mfvpr.evaluation.dataset_ranking import matches_recipe
 from mfvpr.matchers import Scales
 from mfvpr.report import comparisons, runs
-from mfvpr.report.run_files import matched_content
 from mfvpr.systems.assembly import without
 from mfvpr.tuning.learning.models import LOSSES, Options, compare
 from mfvpr.tuning.learning.splits import Part, join_data_sets
@@ -39,21 +38,22 @@ class Prepared(NamedTuple):
     """A data set with its matches, and what they were made from."""
 
     part: Part
-    contents: Mapping[str, Contents]  # of the image files, by side
-    recipe: dict[str, Any]
-    about: dict[str, Any]  # in results
+    inputs: Inputs[Learn]
 
 
 def learn(settings: Learn) -> None:
     """Learn, search, compare on queries that were not learned on, fill the run folder."""
-    settings = with_image_size(settings)
     with jobs.claim(settings.out, settings.dataset["name"]) as folder:
         known = [name for name, scorer in SCORERS.items() if can_learn(scorer)]
         if (method := settings.scorer.get("method")) not in known:
             raise InputError(f"scorer={method or 'several'}: expected one to learn, of {', '.join(known)}")
+        if len(sizes := settings.features.get("patch_sizes", [])) > 1:
+            raise InputError(f"features.patch_sizes={sizes}: expected one size, since learning knows one scale")
         axes, watch = axes_of(settings), Stopwatch()
         also, reported = compose_data_sets(settings.also or []), compose_data_sets(settings.report or [])
-        teach = [_prepare(settings, dataset, bool(reported), watch) for dataset in (settings.dataset, *also)]
+        teach = [_prepare(settings, settings.dataset, bool(reported), watch)]
+        settings = teach[0].inputs.settings
+        teach += [_prepare(settings, dataset, bool(reported), watch) for dataset in also]
         report, data = [_prepare(settings, dataset, True, watch) for dataset in reported], teach[0].part
         if report:
             require_disjoint(teach, report)
@@ -68,14 +68,24 @@ def learn(settings: Learn) -> None:
         )
         with watch("learning"):
             checkpoints = _checkpoints(settings, axes, data, teach + report)
-            matched, runtime = (data.protocol, data.match_set, data.candidates), cache_of(settings).runtime
+            matched, runtime = (data.protocol, data.match_set, data.candidates), teach[0].inputs.cache.runtime
             comparison = compare(axes, *matched, options, checkpoints=checkpoints, runtime=runtime)
-        heading = _heading(settings, data, teach, report)
+        words = f"{sum(len(half.report) for half in data.protocol.halves)} queries of the other half of the path"
+        words = ", ".join(each.part.name for each in report) or words
+        names = ", ".join(each.part.name for each in teach)
+        truths = (each.inputs.ground_truth for each in report or teach)
+        heading = (
+            f"{names}: {score_in_words(settings)}, learned here and reported on {words}; {truth_in_words(*truths)}"
+        )
         text = f"{heading}\n\n{comparisons.comparison_text(comparison)}"
         left_out = ("dataset", "cache", "out", "checkpoints", "cluster", "compiled")
-        about = {"data_sets": [each.about for each in teach], "reported_sets": [each.about for each in report]}
+        about, ground_truth = teach[0].inputs.about, teach[0].inputs.ground_truth
+        if report:
+            data_sets, reported_sets = ([each.inputs.about for each in sets] for sets in (teach, report))
+            about = {"data_sets": data_sets, "reported_sets": reported_sets}
+            ground_truth = {each.part.name: each.inputs.ground_truth for each in report}
         results = {
-            **(about if report else teach[0].about),
+            **about,
             **comparisons.comparison_json(comparison),
             "settings": without(to_values(settings), *left_out),
             "seconds": watch.seconds,
@@ -91,28 +101,16 @@ def learn(settings: Learn) -> None:
             write_text(new / "summary.txt", f"{text}\n")
 
         figures = comparisons.comparison_figures(comparison)
-        by_name = {each.part.name: each.about["ground_truth"] for each in report}
-        ground_truth = by_name if report else teach[0].about["ground_truth"]
         jobs.write_results(folder, settings, ground_truth, text=text, write=write, figures=figures)
 
 
 def _prepare(settings: Learn, dataset: Mapping[str, Any], is_whole: bool, watch: Stopwatch) -> Prepared:
     """A data set of which all queries, or one half at a time, are learned or reported on."""
-    if len(sizes := settings.features.get("patch_sizes", [])) > 1:
-        raise InputError(f"features.patch_sizes={sizes}: expected one size, since learning knows one scale")
     inputs = prepare(replace(settings, dataset=dataset), watch)
-    split: Split | None = None if is_whole else settings.split
-    protocol = inputs.protocol(split)
-    matches, candidates = inputs.match(watch)
+    protocol = inputs.protocol(None if is_whole else settings.split)
+    matches, candidates = inputs.match()
     assert not isinstance(matches, Scales)
-    about = {
-        "dataset": inputs.dataset.name,
-        "ground_truth": inputs.ground_truth,
-        "data_fingerprint": fingerprints(inputs.contents),
-    }
-    return Prepared(
-        Part(label(dataset), protocol, matches, candidates), inputs.contents, inputs.matches_recipe(), about
-    )
+    return Prepared(Part(label(dataset), protocol, matches, candidates), inputs)
 
 
 def label(settings: Mapping[str, Any]) -> str:
@@ -123,18 +121,15 @@ def label(settings: Mapping[str, Any]) -> str:
 def require_disjoint(teach: list[Prepared], report: list[Prepared]) -> None:
     """Raise an InputError for reports on images that were learned on, and for queries that would count twice."""
     for first, second in itertools.product(teach, report):
-        sides = itertools.product(second.contents.values(), first.contents.values())
+        sides = itertools.product(second.inputs.contents.values(), first.inputs.contents.values())
         if same := sum(bool(rows) for pair in sides for rows in own_rows(*pair)):
-            expected = f"other images than those of {first.part.name}, which is learned on"
-            raise InputError(f"report={second.part.name}: expected {expected}; {same} are the same")
+            raise InputError(f"report={second.part.name}: expected no images of {first.part.name}; {same} are the same")
     for first, second in (*itertools.combinations(teach, 2), *itertools.combinations(report, 2)):
-        if same := sum(map(bool, own_rows(second.contents["query"], first.contents["query"]))):
-            expected = f"other queries than those of {first.part.name}"
-            raise InputError(f"{second.part.name}: expected {expected}; {same} are the same, and would count twice")
+        if same := sum(map(bool, own_rows(second.inputs.contents["query"], first.inputs.contents["query"]))):
+            raise InputError(f"{second.part.name}: expected no queries of {first.part.name}; {same} would count twice")
     for first, second in itertools.combinations(report, 2):
-        if any(own_rows(second.contents["database"], first.contents["database"])):
-            names = f"{first.part.name} and {second.part.name}"
-            warn(f"{names} are of one map: their queries are no independent ones, intervals and p are too small")
+        if any(own_rows(second.inputs.contents["database"], first.inputs.contents["database"])):
+            warn(f"{first.part.name} and {second.part.name} are of one map: intervals and p are too small")
 
 
 def _checkpoints(settings: Learn, axes: Axes, data: Part, sets: list[Prepared]) -> Checkpoints | None:
@@ -143,7 +138,7 @@ def _checkpoints(settings: Learn, axes: Axes, data: Part, sets: list[Prepared]) 
     if root is None:
         return None
     recipe = {
-        "matches": [data_set.recipe for data_set in sets],
+        "matches": [matches_recipe(of.dataset, of.dataset.only, of.pipeline, of.cache) for _, of in sets],
         "scorer": recipe_of(axes.scorer),
         "tolerances": to_values(settings.recall),
         **{name: getattr(settings, name) for name in (*_TRAINING, "loss", "inputs")},
@@ -153,15 +148,3 @@ def _checkpoints(settings: Learn, axes: Axes, data: Part, sets: list[Prepared]) 
         "versions": {**{name: versions()[name] for name in ("mfvpr", "jax", "numpy")}, "optax": version("optax")},
     }
     return Checkpoints(expand_user(root), recipe)
-
-
-def _heading(settings: Learn, data: Part, teach: list[Prepared], report: list[Prepared]) -> str:
-    matched = matched_content({"matching": settings.matching, "features": settings.features})
-    system = f"{settings.scorer['method']} score, {matched}"
-    ground_truth = truth_in_words(*(data_set.about["ground_truth"] for data_set in report or teach))
-    if report:
-        learned, reported = (", ".join(each.part.name for each in sets) for sets in (teach, report))
-        return f"{learned}: {system}; what was learned here is reported on {reported}; {ground_truth}"
-    queries = sum(len(half.report) for half in data.protocol.halves)
-    halves = f"each of {queries} queries is reported on by what was learned on the other half of the path"
-    return f"{data.name}: {system}; {halves}; {ground_truth}"

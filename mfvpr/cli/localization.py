@@ -2,9 +2,7 @@
 
 import json
 import time
-import warnings
 from collections.abc import Iterator
-from contextlib import suppress
 from pathlib import Path, PurePath
 from typing import Any
 
@@ -15,13 +13,14 @@ from mfvpr.cli.console import tell, track, warn
 from mfvpr.cli.jobs import dataset_of
 from mfvpr.cli.schema import Localize, MapBuild
 from mfvpr.datasets import image_folder, read_image
+from mfvpr.datasets.contents import state_of
 from mfvpr.datasets.image_reading import VIDEO_SUFFIXES, read_frames
-from mfvpr.evaluation import Confidence, System
 from mfvpr.localization import Drive, Located, Map, Route
-from mfvpr.localization.map_images import fit_to_map, read_settings, read_system
+from mfvpr.localization.map_settings import fit_to_map, read_settings, read_system
 from mfvpr.report.runs import file_names
 from mfvpr.storage.maps import Entry
 from mfvpr.systems import assembly
+from mfvpr.systems.assembly import without
 from mfvpr.utils import Runtime
 from mfvpr.utils.errors import InputError
 from mfvpr.utils.files import IMAGE_SUFFIXES, canonical_name, expand_user, printable
@@ -49,11 +48,7 @@ def print_map(folder: Path) -> None:
 
 def calibrate(folder: Path, database: Path, queries: Path) -> None:
     """Fit the confidence of a map on a drive: query i shows database image i, both folders of images along a path."""
-    with warnings.catch_warnings(record=True) as caught:
-        warnings.simplefilter("always")
-        Map.open(folder).calibrate(database, queries)
-    for warning in caught:
-        warn(str(warning.message))
+    Map.open(folder).calibrate(database, queries)
     print(printable(f"{folder}: calibrated on {queries}; use threshold= of mfvpr localize"))
 
 
@@ -72,7 +67,13 @@ def localize(settings: Localize) -> None:
     """Print a line for every image as soon as it is localized; errors of an image stand in its line."""
     folder, runtime = expand_user(settings.map), Runtime(memory=settings.memory)
     system = read_system(folder)
-    confidence = _confidence(settings, system)
+    confidence = None
+    if settings.confidence is not None:
+        from mfvpr.cli.evaluation import fitting_confidences  # here: it imports the reports
+
+        made = read_settings(folder)
+        used = without(made, "fusion") if made["final"] == "score" else made
+        confidence = fitting_confidences(settings.confidence, system, used)[0][system.headline]
     robot_map = Map(folder, system, confidence=confidence, threshold=settings.threshold, runtime=runtime)
     drive = _Drive(robot_map, settings)
     for number, (name, image) in enumerate(images_of(settings)):
@@ -81,13 +82,11 @@ def localize(settings: Localize) -> None:
         line: dict[str, Any] = {}
         try:
             drive.localize(number, name, image, line)
-        finally:  # the prediction must not be lost if its image cannot be added or drawn
+        finally:  # the prediction must not be lost if its image cannot be added
             if line:
                 print(printable(json.dumps({"image": name} | line, ensure_ascii=False, allow_nan=False)), flush=True)
     if drive.failed:
-        raise InputError(f"{drive.failed} of the images could not be localized; their lines say why")
-    if drive.undrawn:
-        raise InputError(f"{drive.undrawn} of the figures could not be drawn; warnings say why")
+        raise InputError(f"{drive.failed} of the images could not be localized or drawn; lines and warnings say why")
     if drive.missing:
         names = ",".join(sorted(map(str, drive.missing)))
         raise InputError(f"figures=[{names}]: expected rows of localized images, from 0, or names as in the lines")
@@ -97,13 +96,13 @@ class _Drive:
     """One drive through a map: images are localized, added and drawn one by one."""
 
     def __init__(self, robot_map: Map, settings: Localize) -> None:
-        self._map, self._settings, figures = robot_map, settings, settings.figures
-        advance = None if isinstance(settings.route, str) else settings.route
-        tell_route = lambda text: warn(f"route={advance}: {text} (route=auto)")  # noqa: E731
-        self._route = None if settings.route is None else Route(Drive(advance), warn=tell_route)
+        self._map, self._settings, self._route, figures = robot_map, settings, None, settings.figures
+        if settings.route is not None:
+            advance = None if isinstance(settings.route, str) else settings.route
+            self._route = Route(Drive(advance), warn=lambda text: warn(f"route={advance}: {text} (route=auto)"))
         self._wanted = set(range(figures) if isinstance(figures, int) else figures)
         self.missing = set() if isinstance(figures, int) else {*self._wanted}  # figures whose image did not come
-        self.failed = self.undrawn = 0
+        self.failed = 0
         self._root = None if settings.root is None else expand_user(settings.root)
         if self._root and not self._root.is_dir():
             raise InputError(f"root={self._root}: expected the folder of the map's images, got no folder")
@@ -143,7 +142,7 @@ class _Drive:
                 line["figure"] = str(path)
             except Exception as error:  # of any kind from Matplotlib; the drive goes on
                 line["figure"] = None
-                self.undrawn += 1
+                self.failed += 1
                 warn(f"{path}: not drawn ({error})")
 
     def _route_entry(self, located: Located | None) -> dict[str, Any]:
@@ -153,19 +152,6 @@ class _Drive:
             return {"route": None}
         numbers = {"p": round(located.p, 4), "advance": round(located.advance, 2), "off": round(located.off, 4)}
         return {"route": {"place": located.row if located.row is None else self._map.place(located.row)} | numbers}
-
-
-def _confidence(settings: Localize, system: System) -> Confidence | None:
-    """The confidence that the settings name, of the score that the map was made with."""
-    if settings.confidence is None:
-        return None
-    from mfvpr.cli.evaluation import ConfidenceFile  # here: it imports the reports
-
-    map_settings, name = read_settings(expand_user(settings.map)), system.headline
-    if map_settings["final"] == "score":
-        del map_settings["fusion"]
-    file, scorers = ConfidenceFile.read(settings.confidence), system.final_scores[name].scorers
-    return file.of(name, scorers, map_settings, map_settings["candidates"])
 
 
 def images_of(settings: Localize) -> Iterator[tuple[str, Path | Pixels]]:
@@ -193,14 +179,11 @@ def _watch(folder: Path) -> Iterator[Path]:
 
     An image whose file changes later, as when a camera writes slowly, comes again.
     """
-    done, before = dict[Path, tuple[int, int]](), dict[Path, tuple[int, int]]()
+    done, before = dict[Path, list[int] | None](), dict[Path, list[int] | None]()
     tell(f"watching {folder}; end with Ctrl-C")
     while True:
-        states = {}
-        for path in sorted(folder.iterdir()):
-            with suppress(OSError):  # it has been removed
-                if path.suffix.lower() in IMAGE_SUFFIXES and path.is_file():
-                    states[path] = (path.stat().st_size, path.stat().st_mtime_ns)
+        paths = [path for path in sorted(folder.iterdir()) if path.suffix.lower() in IMAGE_SUFFIXES and path.is_file()]
+        states = {path: state_of(path) for path in paths}
         for path, state in states.items():
             if before.get(path) == state != done.get(path):
                 done[path] = state

@@ -30,22 +30,17 @@ COMMANDS = {
     "convert": "write predictions as files of other programs: candidates, trajectories, shifts with times",
     "report": "write the page of a run folder (evaluation, sweep, learning, multirun), or of evaluations compared",
 }
-_JOBS = {  # command and job of each program with settings
-    "evaluate": ("mfvpr evaluate", "mfvpr.cli.evaluation:evaluate"),
-    "sweep": ("mfvpr sweep", "mfvpr.cli.sweeping:sweep_program"),
-    "learn": ("mfvpr learn", "mfvpr.cli.learning:learn"),
-    "map": ("mfvpr map build", "mfvpr.cli.localization:build_map"),
-    "localize": ("mfvpr localize", "mfvpr.cli.localization:localize"),
-    "paper": ("python -m experiments.paper", "experiments.paper.program:paper"),
-}
-
-_COMMANDS: dict[str, str | dict[str, str]] = {  # functions of mfvpr.cli, with arguments instead of settings
+_FUNCTIONS: dict[str, Any] = {  # of mfvpr.cli: the job of a program with settings, or functions of arguments
+    "evaluate": "evaluation:evaluate",
+    "sweep": "sweeping:sweep_program",
+    "learn": "learning:learn",
     "map": {
         "build": "localization:build_map",
         "info": "localization:print_map",
         "calibrate": "localization:calibrate",
         "add": "localization:add_images",
     },
+    "localize": "localization:localize",
     "weights": {
         "list": "commands:list_weights",
         "add": "commands:add_weights",
@@ -78,22 +73,23 @@ def run(program: str) -> None:
     """Run a program with the arguments of the command line."""
     if program == "demo":
         program, sys.argv[1:1] = "evaluate", ["scorer=demo"]
-    if program in _COMMANDS and (program != "map" or sys.argv[1:2] != ["build"]):
-        run_command(f"mfvpr {program}", COMMANDS[program], partial(_add_functions, functions=_COMMANDS[program]))
-        return
-    if program == "map":
+    functions = _FUNCTIONS[program]
+    if program == "map" and sys.argv[1:2] == ["build"]:
         del sys.argv[1]
-    launch(program)
+        launch("map", f"mfvpr.cli.{functions['build']}")
+    elif program in ("evaluate", "sweep", "learn", "localize"):
+        launch(program, f"mfvpr.cli.{functions}")
+    else:
+        run_command(f"mfvpr {program}", COMMANDS[program], partial(_add_functions, functions=functions))
 
 
-def launch(program: str) -> None:
-    """Run a program with the settings of the command line; one line and an exit code for wrong ones."""
+def launch(program: str, job: str) -> None:
+    """Run a job `package.module:function` with the settings of the command line; one line for wrong ones."""
     with one_line():
         _prepare_process()
         from mfvpr.cli.command_line import run as run_settings  # here, where Ctrl-C is handled
 
-        command, job = _JOBS[program]
-        run_settings(program, partial(pkgutil.resolve_name, job), command)
+        run_settings(program, partial(pkgutil.resolve_name, job))
 
 
 class Parser(argparse.ArgumentParser):

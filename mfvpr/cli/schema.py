@@ -72,9 +72,7 @@ class RecallSettings:
 class Resources:
     """Settings that change no result."""
 
-    memory: float | None = setting(
-        None, POSITIVE | None, "GB that features may take while they are matched; null = a third of what is free"
-    )
+    memory: float | None = setting(None, POSITIVE | None, "GB of features in matching; null = a third of what is free")
     compiled: bool = setting(_is_compiled, FLAG, "keep compiled programs on disk: the next process starts fast")
 
 
@@ -83,9 +81,7 @@ class Shared(Resources):
     """Settings of all programs that evaluate."""
 
     devices: int | str = setting(1, COUNT | "all", "that share the queries: how many, or all")
-    cache: str | None = setting(
-        lambda: f"{_folder()}/features", PATH | None, "features already taken from the same images; null = none"
-    )
+    cache: str | None = setting(lambda: f"{_folder()}/features", PATH | None, "of features and matches; null = none")
 
 
 @dataclass(frozen=True)
@@ -104,32 +100,20 @@ class Common(SystemSettings, Shared):
     def __post_init__(self) -> None:
         super().__post_init__()
         check_data_set(self.dataset)
-        if self.cluster:
-            known = {"name": Setting("", one_of("local", "slurm", "address")), **settings_of(_Workers)}
-            check_values(known, self.cluster, "cluster.")
-            if self.cache is None:
-                raise InputError("cluster: expected cache=DIR as well, a folder that all workers share")
+        check_values(settings_of(_Workers), self.cluster, "cluster.")
+        if self.cluster and self.cache is None:
+            raise InputError("cluster: expected cache=DIR as well, a folder that all workers share")
 
 
 @dataclass(frozen=True)
 class Evaluate(Common):
     """Re-rank a data set and print its recall."""
 
-    figures: Any = setting(
-        6, _FIGURES, "queries shown, with correct and incorrect predictions; or which: [42,48] rows, or names"
-    )
-    previous_queries: int = setting(
-        0, whole(0, 1000), "raise scores near the places of the last N queries (SSM-VPR: 2); needs a drive in order"
-    )
-    sequence: Any = setting(
-        None, or_list(_SEQUENCE) | None, "rank the queries of a drive together (extra rankings); needs a drive in order"
-    )
-    confidence: str | None = setting(
-        None, PATH | None, "confidence.json of a run on other images; null = fit one, on each half of the path"
-    )
-    threshold: float | None = setting(
-        None, _SHARE, "of the confidence: below it the prediction is `no place`; needs confidence"
-    )
+    figures: Any = setting(6, _FIGURES, "queries shown: how many; or which: [42,48] rows, or names")
+    previous_queries: int = setting(0, whole(0, 1000), "raise scores near the places of the last N queries of a drive")
+    sequence: Any = setting(None, or_list(_SEQUENCE) | None, "rank the queries of a drive together (extra rankings)")
+    confidence: str | None = setting(None, PATH | None, "confidence.json of a run on other images; null = fit one here")
+    threshold: float | None = setting(None, _SHARE, "of the confidence: below it the prediction is `no place`")
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -179,9 +163,7 @@ class Learn(Searched):
     patience: int = setting(10, COUNT, "validations without gain")
     batch: int = setting(8, whole(1, 1024), "queries of a step")
     learning_rate: float = setting(0.01, POSITIVE)
-    inputs: str = setting(
-        "relative", one_of("relative", "absolute"), "of the match weights; relative to the pair's other matches"
-    )
+    inputs: str = setting("relative", one_of("relative", "absolute"), "of weights; relative to the pair's matches")
     hidden: int = setting(16, whole(1, 1024), "width of the network of match weights")
     checkpoints: str | None = setting(None, PATH | None, "folder of unfinished trainings; null = beside the features")
     seed: int = setting(0, INDEX)
@@ -219,28 +201,16 @@ class Localize(Resources):
     watch: bool = setting(False, FLAG, "of a folder: localize new images as well, until Ctrl-C")
     every: int = setting(1, COUNT, "of a video: every so many frames")
     alternatives: int = setting(5, INDEX, "candidates in each line")
-    recent: int = setting(
-        0, INDEX, "number of newest images to leave out: of a drive that is being added, they show the same place"
-    )
-    confidence: str | None = setting(
-        None, PATH | None, "confidence.json of an evaluation with the same settings; null = that of a calibrated map"
-    )
+    recent: int = setting(0, INDEX, "newest images to leave out: of a drive that is added, they show the same place")
+    confidence: str | None = setting(None, PATH | None, "confidence.json of an evaluation; null = that of the map")
     threshold: float | None = setting(None, _SHARE, "of the confidence: below it there is no place")
-    field_of_view: float | None = setting(
-        None, number(5, 179) | None, "of the camera, horizontal, degrees: lines have `shift_angles`"
-    )
+    field_of_view: float | None = setting(None, number(5, 179) | None, "horizontal, degrees: adds `shift_angles`")
     route: float | str | None = setting(
         None,
         number(-1000, 1000) | one_of("auto", None),
-        "auto: lines have `route`, the position estimated from all images so far; only for maps in the order of a "
-        "drive. A number is the speed, in rows of the map from one image to the next",
+        "of a map of a drive: add the position estimated from all images so far; a number = map rows per image",
     )
-    add: bool = setting(
-        False,
-        FLAG,
-        "add every image to the end of the map after it is localized; its name, the absolute path, is its place. An "
-        "image that is in the map is localized among the images before it",
-    )
+    add: bool = setting(False, FLAG, "add each image, after it is localized, to the end of the map: place = its path")
     figures: Any = setting(0, _FIGURES, "localizations that are drawn: how many, or which rows or names; needs out")
     out: str | None = setting(None, PATH | None, "folder of the figures")
     root: str | None = setting(None, PATH | None, "folder of the map's images, which figures then show")
@@ -267,8 +237,17 @@ DATA_SET_NAME = text(r"[\w-][\w.-]*", "letters, digits, - and _")
 
 
 @dataclass(frozen=True)
-class _Images:
-    """Folders of images."""
+class _Published:
+    """A published data set."""
+
+    name: str = setting("", DATA_SET_NAME)
+    root: str = setting(REQUIRED, PATH)
+    seasons: Any = setting(None, list_of(one_of("fall", "spring", "summer", "winter"), 2), "database, queries")
+
+
+@dataclass(frozen=True)
+class _Images(_Published):
+    """Folders of images, which `root` may hold."""
 
     database: str = setting(REQUIRED, PATH)
     queries: Any = setting(REQUIRED, or_list(PATH))
@@ -276,15 +255,11 @@ class _Images:
         None,
         one_of("order", "index", "utm", "none", "label", None),
         "order: query i shows database image i; index: a file of pairs; utm: @easting@northing@ names; label: two csv "
-        "files of name,label; none: rankings only; nothing is assumed",
+        "files of name,label; none: rankings only",
     )
     index_file: str | None = setting(None, PATH | None, "for index: .csv, .npz or .json")
-    widen_index: bool = setting(
-        False, FLAG, "for index: whether database images within recall.tolerances count as well, as in a sequence"
-    )
-    exclude_neighbors: int | None = setting(
-        None, INDEX | None, "where queries are database images: leave those within so many frames out; 0 = itself alone"
-    )
+    widen_index: bool = setting(False, FLAG, "for index: images within recall.tolerances count as well")
+    exclude_neighbors: int | None = setting(None, INDEX | None, "frames around a query itself to leave out; 0 = itself")
     orient: bool = setting(True, FLAG, "turn images as their EXIF orientation says")
     bits: int | None = setting(16, whole(8, 16) | None, "that 16-bit images use, of which the upper 8 are taken")
 
@@ -301,28 +276,22 @@ class _Folder(_Images):
 class _Drawn:
     """Streets that are drawn."""
 
+    name: str = setting("", DATA_SET_NAME)
     seed: int = setting(0, INDEX)
     cache: str = setting(_folder, PATH)
-
-
-@dataclass(frozen=True)
-class _Published:
-    """A published data set."""
-
-    root: str = setting(REQUIRED, PATH)
-    seasons: Any = setting(None, list_of(one_of("fall", "spring", "summer", "winter"), 2), "database, queries")
 
 
 @dataclass(frozen=True)
 class _Workers:
     """A cluster that is started or connected to."""
 
+    name: str = setting("", one_of("local", "slurm", "address"))
     workers: int = setting(2, COUNT, "processes; or jobs of Slurm, one worker each")
     options: str = setting("--cpus-per-task=4 --mem=16G --time=240", TEXT | "", "of sbatch for each job")
     address: str = setting(REQUIRED, text(r"(tcp|tls|ucx)://\S+:\d+", "tcp://HOST:PORT"))
 
 
-OTHERS = (_Folder, _Drawn, _Published, _Workers)  # of data sets and clusters
+OTHERS = (_Folder, _Drawn, _Workers)  # of data sets and clusters
 PROGRAMS: dict[str, type] = {
     "evaluate": Evaluate,
     "sweep": Sweep,
@@ -346,34 +315,27 @@ def register() -> None:
     for choice in GROUPS:
         for name, known in choices_of(choice).items():
             store(group=choice, name=name, node={KEYS.get(choice, "name"): name, **default_values(known)})
-    workers, drawn = default_values(settings_of(_Workers)), default_values(settings_of(_Drawn))
-    store(group="cluster", name="local", node={"name": "local", "workers": workers["workers"]})
-    store(group="cluster", name="slurm", node={"name": "slurm", "workers": 8, "options": workers["options"]})
-    store(group="cluster", name="address", node={"name": "address", "address": workers["address"]})
-    store(group="dataset", name="folder", node={"name": "folder", **default_values(settings_of(_Folder))})
-    store(group="dataset", name="sequences", node={"name": "sequences", **default_values(settings_of(_Images))})
-    for name in ("streets", "streets_seasons"):
-        store(group="dataset", name=name, node={"name": name, **drawn})
+    options = default_values(settings_of(_Workers))["options"]
+    store(group="cluster", name="local", node={"name": "local", "workers": 2})
+    store(group="cluster", name="slurm", node={"name": "slurm", "workers": 8, "options": options})
+    store(group="cluster", name="address", node={"name": "address", "address": REQUIRED})
+    for name, owner in {"folder": _Folder, "sequences": _Images, "streets": _Drawn, "streets_seasons": _Drawn}.items():
+        defaults = without(default_values(settings_of(owner)), "root", "seasons")
+        store(group="dataset", name=name, node=defaults | {"name": name})
     OmegaConf.register_new_resolver("settings", _describe, replace=True)
-
-
-def _data_set_schema(settings: Mapping[str, Any]) -> dict[str, Setting]:
-    """The settings of a data set, by those that it has."""
-    owner = _Drawn if "cache" in settings else _Published if "database" not in settings else _Folder
-    known: dict[str, Any] = {"name": Setting("", DATA_SET_NAME), **settings_of(_Published), **settings_of(owner)}
-    return {name: known[name] for name in settings if name in known}
 
 
 def check_data_set(settings: Mapping[str, Any]) -> None:
     """Raise an InputError for a setting of a data set that is not allowed."""
-    check_values(_data_set_schema(settings), settings, "dataset.")
+    owner = _Drawn if "cache" in settings else _Folder if "database" in settings else _Published
+    check_values(settings_of(owner), settings, "dataset.")
 
 
 def _describe(program: str, *, _root_: Any) -> str:
     """A line for each setting in `--help`, with its value, and what it means."""
     values: Any = OmegaConf.to_container(_root_)
     known: dict[str, Any] = settings_of(PROGRAMS[program]) | {"cluster": settings_of(_Workers)}
-    known["dataset"] = _data_set_schema(values.get("dataset", {}))
+    known["dataset"] = settings_of(_Folder) | settings_of(_Drawn)
     for name in GROUPS[:3]:
         known[name] = choices_of(name).get(values.get(name, {}).get("name"), {})
     text = "\n".join(_lines(known, without(values, "hydra")))
@@ -384,10 +346,11 @@ def _lines(known: Any, settings: Mapping[str, Any], indent: str = "") -> Iterato
     known = choices_of("scorer").get(settings.get("method", ""), known)
     for name, value in settings.items():
         about = known.get(name, {}) if isinstance(known, Mapping) else {}
-        words = ""
-        if isinstance(about, Setting):
-            words = "; ".join(filter(None, [about.unit, about.note.replace("None", "null"), about.rule.expected]))
-        shown = json.dumps(value) if isinstance(value, bool | None) else "" if isinstance(value, Mapping) else value
-        yield f"{indent}{name}: {shown}" + f"  # {words}" * bool(words)
         if isinstance(value, Mapping):
+            yield f"{indent}{name}:"
             yield from _lines(about, value, f"{indent}  ")
+            continue
+        words = [about.unit, about.note, about.rule.expected] if isinstance(about, Setting) else []
+        text = "; ".join(filter(None, words)).replace("None", "null")
+        shown = json.dumps(value) if isinstance(value, bool | None) else value
+        yield f"{indent}{name}: {shown}" + f"  # {text}" * bool(text)

@@ -7,56 +7,47 @@ from pathlib import Path
 from typing import Any
 
 from mfvpr.cli import jobs
-from mfvpr.cli.jobs import Inputs, prepare, truth_in_words, with_image_size
+from mfvpr.cli.jobs import prepare, score_in_words, truth_in_words
 from mfvpr.cli.schema import Searched
 from mfvpr.cli.schema import Sweep as Settings
 from mfvpr.core import Scorer
-from mfvpr.core.scorer import numbers_by_name, static_names
 from mfvpr.datasets import Dataset
-from mfvpr.datasets.contents import fingerprints
 from mfvpr.evaluation import Pipeline, System, evaluation_protocol, match_sequence
 from mfvpr.evaluation.drives import DriveFilter
 from mfvpr.evaluation.protocol import Split
 from mfvpr.evaluation.rankings import RETRIEVAL
 from mfvpr.features import Aggregated, Sift, VladFitting
 from mfvpr.report import sweeps
-from mfvpr.report.run_files import matched_content
 from mfvpr.report.runs import LAST
 from mfvpr.report.sweeps import Sweep, axes_json
 from mfvpr.retrieval import Retrieval
 from mfvpr.storage import FeatureCache
 from mfvpr.systems import assembly
 from mfvpr.systems.assembly import choices_of
-from mfvpr.tuning.sweeps import Axes, DriveRanking, Outcome, SweepOptions, require_optuna, search_grid, search_optuna
+from mfvpr.tuning.sweeps import Axes, DriveRanking, SweepOptions, require_optuna, search_grid, search_optuna
 from mfvpr.utils import InputError, Runtime, Stopwatch
 from mfvpr.utils.fields import NOT_NEGATIVE, check_values, list_of, to_values
 from mfvpr.utils.fields import Setting as Declared
 from mfvpr.utils.files import expand_user
 from mfvpr.utils.fingerprints import versions
 
-_MOST_SETTINGS = 1_000_000
-
 
 def sweep_program(settings: Settings) -> None:
     """Search the settings, print the table, fill the run folder."""
-    settings = with_image_size(settings)
     if settings.final == "combined" and settings.grid.get("c") is None and any(settings.grid.values()):
         settings = replace(settings, grid={**settings.grid, "c": [settings.fusion.c]})  # the combined score is swept
     with jobs.claim(settings.out, settings.dataset["name"]) as folder:
         axes, watch = axes_of(settings), Stopwatch()
         if settings.search == "optuna":
             require_optuna()
-        elif axes.size > _MOST_SETTINGS:
-            raise InputError(f"grid: expected at most {_MOST_SETTINGS:,} settings, got {axes.size:,}")
         inputs = prepare(settings, watch)
-        protocol = inputs.protocol(settings.split)
-        matches, candidates = inputs.match(watch)
-        method = settings.sequence
+        settings, protocol = inputs.settings, inputs.protocol(settings.split)
+        matches, candidates = inputs.match()
         options = SweepOptions(
             ks=settings.recall.ks,
             ties=settings.ties,
             retrieval_score=settings.fusion.retrieval_score,
-            sequence=method and DriveRanking.of(DriveFilter(method), inputs.dataset, protocol),
+            sequence=settings.sequence and DriveRanking.of(DriveFilter(settings.sequence), inputs.dataset, protocol),
             settings_per_block=settings.chunk.settings,
             queries_per_block=settings.chunk.queries,
             folder=expand_user(settings.cache) if settings.cache else None,
@@ -68,18 +59,16 @@ def sweep_program(settings: Settings) -> None:
             else:
                 trials = {"trials": settings.trials, "seed": settings.seed}
                 outcome = search_optuna(axes, protocol, matches, candidates, options, **trials)
-        heading = _heading(settings, inputs, outcome)
+        sequence = f", {settings.sequence} sequence" if settings.sequence else ""
+        heading = (
+            f"{inputs.dataset.name}: {len(inputs.dataset.queries)} queries, {outcome.protocol.views[0].shape[1]} "
+            f"candidates of {len(inputs.dataset.database)} database images, {len(outcome.settings)} settings of the "
+            f"{score_in_words(settings)}{sequence}; {truth_in_words(inputs.ground_truth)}"
+        )
         values = to_values(settings)
         names = ("scorer", "features", "retrieval", "matching", "candidates", "fusion", "final", "sequence")
-        results = {
-            "dataset": inputs.dataset.name,
-            "data_fingerprint": fingerprints(inputs.contents),
-            **{name: values[name] for name in names},
-            "ground_truth": inputs.ground_truth,
-            **sweeps.sweep_json(outcome),
-            "seconds": watch.seconds,
-            "versions": versions(),
-        }
+        results = {**inputs.about, **{name: values[name] for name in names}, **sweeps.sweep_json(outcome)}
+        results |= {"seconds": watch.seconds, "versions": versions()}
         jobs.write_results(
             folder,
             settings,
@@ -99,8 +88,7 @@ def axes_of(settings: Searched) -> Axes:
     if isinstance(chosen.get("weight"), list):
         raise InputError("scorer.weight: expected one weight, got a list; to compare weights, set grid.weight")
     if settings.fusion.c == "zscore":
-        reason = "as sweeps and learning add retrieval to one score; fusion.c=auto ranks alike for weights of 1"
-        raise InputError(f"fusion.c=zscore: expected a number or auto, {reason}")
+        raise InputError("fusion.c=zscore: expected a number, or auto, which ranks alike for weights of 1")
     if not values:
         raise InputError("grid: expected at least one axis, such as 'grid.sigma=[10,22.5]', or an experiment=")
     [scorer] = assembly.scorers(chosen).values()
@@ -109,23 +97,10 @@ def axes_of(settings: Searched) -> Axes:
     known |= {"max_distance": matching["max_distance"], "c": Declared(None, NOT_NEGATIVE | "auto")}
     check_values({name: replace(each, rule=list_of(each.rule)) for name, each in known.items()}, values, "grid.")
     if limit is not None and any(value is None or value > limit for value in values.get("max_distance", [])):
-        expected = f"values up to {limit}, as matching.max_distance={limit} leaves no other matches"
-        raise InputError(f"grid.max_distance={values['max_distance']}: expected {expected}")
+        raise InputError(f"grid.max_distance={values['max_distance']}: expected values up to matching.max_distance")
     defaults = {**chosen, "max_distance": limit, "c": settings.fusion.c if settings.final == "combined" else 0}
     with assembly.in_group("grid", values):
         return Axes(scorer, values, defaults)
-
-
-def _heading(settings: Settings, inputs: Inputs, outcome: Outcome) -> str:
-    dataset, size = inputs.dataset, settings.features["image_size"]
-    content = matched_content({"matching": settings.matching, "features": settings.features})
-    content += " at {} x {} px".format(*size) if size and content.endswith("features") else ""
-    sequence = f" + {settings.sequence} sequence" if settings.sequence else ""
-    return (
-        f"{dataset.name}: {len(dataset.queries)} queries, {outcome.protocol.views[0].shape[1]} candidates of "
-        f"{len(dataset.database)} database images, {len(outcome.settings)} settings of the "
-        f"{settings.scorer['method']} score{sequence}, {content}; {truth_in_words(inputs.ground_truth)}"
-    )
 
 
 def sweep(
@@ -170,8 +145,6 @@ def sweep(
         pipeline = Pipeline(sift, Retrieval(Aggregated(sift, VladFitting())))
         system = System(pipeline, {getattr(scorer, "__name__", type(scorer).__name__): scorer})
     name, scorer, c = _only_scorer(system)
-    if clash := {*numbers_by_name(scorer), *static_names(scorer)} & {"split", "thresholds", "out", "cache", "runtime"}:
-        raise InputError(f"{name}.{min(clash)}: mfvpr.sweep means something else by {min(clash)}; rename the field")
     if not axes:
         raise InputError("sweep: expected at least one axis, such as sigma=[5, 10, 22.5]")
     swept = Axes(scorer, axes if c is None else {"c": [c], **axes}, {} if c is None else {"c": c})
@@ -208,8 +181,7 @@ def _only_scorer(system: System) -> tuple[str, Scorer, float | str | None]:
         if system.headline == f"{name} + {RETRIEVAL}" and fusion and not fusion.weights:
             return name, scorer, fusion.c if isinstance(fusion.c, float | int) else "auto"
     expected = f"one that ranks by its only scorer, alone or + {RETRIEVAL}"
-    got = f"one of {', '.join(system.scorers)} that ranks by {system.headline}"
-    raise InputError(f"system: expected {expected}, got {got}; sweep mfvpr.System(system.pipeline, {{name: scorer}})")
+    raise InputError(f"system: expected {expected}, got {', '.join(system.scorers)} ranked by {system.headline}")
 
 
 def _ranking_folder(out: Path, axes: Axes) -> Path:

@@ -32,7 +32,8 @@ MEANS = ("mean", "pooled")  # names in results of the means over sequences, and 
 class IndexFile:
     """Ground truth of a file of pairs or positions, see `mfvpr.datasets.ground_truth.truth_from_file`.
 
-    data = mfvpr.datasets.folder("day/", "night/", ground_truth=mfvpr.datasets.IndexFile("pairs.csv"))
+    Example:
+        data = mfvpr.datasets.folder("day/", "night/", ground_truth=mfvpr.datasets.IndexFile("pairs.csv"))
     """
 
     path: Path | str  # for several sequences, in the folder of each
@@ -43,7 +44,8 @@ class IndexFile:
 class LabelFiles:
     """Ground truth of two files of labels, see `mfvpr.datasets.ground_truth.truth_from_labels`.
 
-    labels = mfvpr.datasets.LabelFiles(queries="night.csv", database="day.csv")
+    Example:
+        labels = mfvpr.datasets.LabelFiles(queries="night.csv", database="day.csv")
     """
 
     queries: Path | str
@@ -57,7 +59,8 @@ GroundTruth = IndexFile | LabelFiles | Truth
 class ImageFolder:
     """Images below `root`.
 
-    mfvpr.datasets.image_folder("day/").read(0)  # [H, W, 3] uint8 RGB
+    Example:
+        mfvpr.datasets.image_folder("day/").read(0)  # [H, W, 3] uint8 RGB
     """
 
     root: Path
@@ -88,7 +91,8 @@ class ImageFolder:
 class QuerySequence:
     """Query images of one drive or walk, with their ground truth; `name` stands in results.
 
-    sequence = mfvpr.datasets.QuerySequence("night", mfvpr.datasets.image_folder("night/"), truth=None)
+    Example:
+        sequence = mfvpr.datasets.QuerySequence("night", mfvpr.datasets.image_folder("night/"), truth=None)
     """
 
     name: str

@@ -27,8 +27,8 @@ class Positives:
     matrix: "scipy.sparse.csr_array"
 
     def __post_init__(self) -> None:
-        if self.matrix.ndim != 2:
-            raise InputError(f"positives: expected a matrix [queries, database], got shape {self.matrix.shape}")
+        if np.ndim(self.matrix) != 2:
+            raise InputError(f"positives: expected a matrix [queries, database], got shape {np.shape(self.matrix)}")
         matrix = scipy.sparse.csr_array(self.matrix, dtype=bool)
         if not matrix.has_canonical_format or not matrix.data.all():
             matrix = matrix.copy()  # of the caller, perhaps

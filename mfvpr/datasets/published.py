@@ -14,8 +14,7 @@ import scipy  # its subpackages are imported at their first use
 from mfvpr.datasets.datasets import Dataset, ImageFolder, QuerySequence, image_folder
 from mfvpr.datasets.ground_truth import FARTHEST, FrameTruth, RadiusTruth, Truth, require_positions, truth_from_file
 from mfvpr.datasets.positives import positives_within
-from mfvpr.io.containers import parse_number, reading, shorten
-from mfvpr.io.object_files import read_objects
+from mfvpr.io.containers import parse_number, reading
 from mfvpr.utils.errors import InputError
 
 SEASONS = ("fall", "spring", "summer", "winter")
@@ -37,11 +36,9 @@ ROBOTCAR_LAYOUT = f"""images/CONDITION/rear/TIMESTAMP.jpg  of {REFERENCE} (the d
                                      {", ".join(CONDITIONS)}
 robotcar_v2_train.txt                per line CONDITION/rear/TIMESTAMP.jpg and 16 numbers, camera to world"""
 PITTSBURGH_LAYOUT = """000/*.jpg, ..., queries_real/000/*.jpg, ...
-datasets/pitts30k_{part}.mat                                 lists and positions; or, as GSV-Cities has them,
-pitts30k_{part}_dbImages.npy, _qImages.npy, _gt.npy (_gt_25m.npy)"""
+datasets/pitts30k_{part}.mat                   lists and positions"""
 MSLS_LAYOUT = """train_val/cph/database/images/*.jpg, raw.csv, postprocessed.csv, subtask_index.csv
-train_val/cph/query, train_val/sf/database, train_val/sf/query  the same; or, as GSV-Cities has them,
-msls_val_dbImages.npy, msls_val_qImages.npy, msls_val_qIdx.npy, msls_val_pIdx.npy  instead of the tables"""
+train_val/cph/query, train_val/sf/database, train_val/sf/query  the same"""
 
 
 Content = tuple[ImageFolder, ImageFolder, Truth]  # database, queries and ground truth of one sequence
@@ -118,7 +115,8 @@ def nordland_27592(root: Path, seasons: tuple[str, str]) -> Content:
         listed = root / f"nordland_imageNames_{side}.txt"
         if listed.exists():  # its names begin with other folders
             with reading(listed, "a list"):
-                names = [PurePosixPath(line).name for line in np.loadtxt(listed, str, ndmin=1).tolist()]
+                lines = map(str.strip, listed.read_text(encoding="utf-8-sig").splitlines())
+            names = [PurePosixPath(line).name for line in lines if line]
             folders.append(listed_images(root / season, names, listed))
         else:
             folders.append(image_folder(root / season))
@@ -160,11 +158,11 @@ def robotcar_seasons(root: Path) -> Dataset:
     """
     path = root / "robotcar_v2_train.txt"
     with reading(path, "a list", "expected lines of a name and the 16 numbers of a pose by rows, the last 0 0 0 1"):
-        lines = np.loadtxt(path, str, ndmin=2)
-        poses = lines[:, 1:].astype(np.float64).reshape(len(lines), 4, 4)
+        lines = [words for line in path.read_text(encoding="utf-8-sig").splitlines() if (words := line.split())]
+        poses = np.array([words[1:] for words in lines], np.float64).reshape(len(lines), 4, 4)
         if not np.allclose(poses[:, 3], (0, 0, 0, 1), rtol=0, atol=1e-6) or not (np.abs(poses) <= FARTHEST).all():
             raise ValueError("numbers that are no pose")
-    images = (PurePosixPath(name).with_suffix(".jpg").as_posix() for name in lines[:, 0].tolist())
+    images = (PurePosixPath(name).with_suffix(".jpg").as_posix() for name, *_ in lines)
     centers: dict[str, np.ndarray] = {}
     for image, center in zip(images, poses[:, :3, 3], strict=True):
         if not np.array_equal(centers.setdefault(image, center), center):
@@ -188,25 +186,16 @@ def robotcar_seasons(root: Path) -> Dataset:
 
 
 def pitts30k(root: Path, name: str) -> Content:
-    """The validation or test part of Pittsburgh30k (Torii et al., CVPR 2013; Arandjelovic et al., CVPR 2016).
-
-    Database images are correct within a radius of the query, or within the lists' 25 m.
-    """
-    structures = [path for path in (root / f"datasets/{name}.mat", root / f"{name}.mat") if path.exists()]
-    if not structures:
-        truths = [path for path in (root / f"{name}_gt_25m.npy", root / f"{name}_gt.npy") if path.exists()]
-        if not truths:
-            lists = f"{name}_gt.npy with {name}_dbImages.npy and {name}_qImages.npy"
-            raise InputError(f"{root}: expected datasets/{name}.mat, or {lists}; get the whole data set")
-        return content_of_lists(root, root / f"{name}_dbImages.npy", root / f"{name}_qImages.npy", truths[0])
-    names, positions = [], []
-    with reading(structures[0], mend=f"expected the structure dbStruct of {name}"):
-        structure = scipy.io.loadmat(structures[0])["dbStruct"][0, 0]
+    """The validation or test part of Pittsburgh30k (Torii et al., CVPR 2013; Arandjelovic et al., CVPR 2016)."""
+    path, names, positions = root / f"datasets/{name}.mat", [], []
+    path = path if path.exists() else root / f"{name}.mat"
+    with reading(path, "the lists of the data set", f"expected the structure dbStruct of {name}"):
+        structure = scipy.io.loadmat(path)["dbStruct"][0, 0]
         for images, xy in (("dbImageFns", "utmDb"), ("qImageFns", "utmQ")):
             names.append([str(cell.item()) for cell in structure[images].ravel()])
             positions.append(require_positions(xy, structure[xy].T, len(names[-1])))
-    database = listed_images(root, names[0], structures[0])
-    queries = listed_images(root, [f"queries_real/{query}" for query in names[1]], structures[0])
+    database = listed_images(root, names[0], path)
+    queries = listed_images(root, [f"queries_real/{query}" for query in names[1]], path)
     return database, queries, RadiusTruth(positions[1], positions[0])
 
 
@@ -215,9 +204,6 @@ def msls_val(root: Path) -> Content:
 
     Queries have a database image within 25 m, as in its own code.
     """
-    lists = [root / f"msls_val_{part}.npy" for part in ("dbImages", "qImages", "pIdx", "qIdx")]
-    if any(path.exists() for path in lists):
-        return content_of_lists(root, *lists)
     flags = {"True": True, "False": False}
     names, positions = {"database": [], "query": []}, {"database": [], "query": []}
     for side, city in product(names, CITIES):
@@ -246,23 +232,6 @@ def msls_val(root: Path) -> Content:
     return database, queries, RadiusTruth(places["query"][rows], places["database"])
 
 
-def content_of_lists(
-    root: Path, database_list: Path, query_list: Path, truth_list: Path, selection_list: Path | None = None
-) -> Content:
-    """Content from the lists of GSV-Cities and OpenVPRLab: image names, and correct database rows by query.
-
-    `selection_list` has the rows of `query_list` that are queries; None = all.
-    """
-    database = listed_images(root, read_names(database_list), database_list)
-    names, rows = read_names(query_list), read_rows(truth_list, len(database))
-    if selection_list is not None:
-        names = [names[row] for selection in read_rows(selection_list, len(names)) for row in selection]
-    if len(rows) != len(names):
-        raise InputError(f"{truth_list}: expected rows of {len(names)} queries, got {len(rows)}")
-    truth = FrameTruth(tuple(rows), len(database), widened=False)
-    return database, listed_images(root, names, query_list), truth
-
-
 def listed_images(root: Path, names: Sequence[str], origin: Path) -> ImageFolder:
     """The images below `root` with the names of a list; `origin` is the list, for messages."""
     if not names or len({*names}) < len(names):
@@ -272,31 +241,6 @@ def listed_images(root: Path, names: Sequence[str], origin: Path) -> ImageFolder
         got = f"{len(missing):,} of the {len(names):,} images of {origin.name} are missing, the first is {missing[0]}"
         raise InputError(f"{root}: {got}; get the whole data set")
     return ImageFolder(root, tuple(names))
-
-
-def read_names(path: Path) -> list[str]:
-    """Read names from an `.npy` file of text."""
-    with reading(path, "a list", "expected an array of NumPy"):
-        names = np.load(path, allow_pickle=False)
-        if names.ndim != 1 or names.dtype.kind != "U":
-            raise InputError(f"expected a list of names, got {names.dtype} {list(names.shape)}")
-        return names.tolist()
-
-
-def read_rows(path: Path, num_database: int) -> list[tuple[int, ...]]:
-    """Read database rows by query from an `.npy` file of lists, or of an array `[Q]` or `[Q, P]`."""
-    with reading(path, "a list", "expected lists of rows"), path.open("rb") as file:
-        is_pickle = b"'|O'" in file.read(128)
-        file.seek(0)
-        lists = read_objects(file, "lists of rows") if is_pickle else np.lib.format.read_array(file, allow_pickle=False)
-        per_query = [np.asarray(rows).reshape(-1) for rows in lists]
-    for query, rows in enumerate(per_query):
-        if rows.size and not (rows.dtype.kind in "iu" and 0 <= rows.min() <= rows.max() < num_database):
-            expected = f"rows from 0 to {num_database - 1}"
-            raise InputError(f"{path}: query {query}: expected {expected}, got {rows.dtype} {shorten(str(rows))}")
-        if len({*rows.tolist()}) < rows.size:  # such as flags, of which most are equal
-            raise InputError(f"{path}: query {query}: expected every row once, got {shorten(str(rows))}")
-    return [tuple(rows.tolist()) for rows in per_query]
 
 
 _SSM_VPR, _SEASONS = "http://imr.ciirc.cvut.cz/Datasets/Ssm-vpr", ("summer", "winter")

@@ -29,10 +29,7 @@ class FileEntry(NamedTuple):
 
 
 class H5File:
-    """An hloc file: images are the groups that hold datasets, named by their relative paths.
-
-    `entries` are the places of the images' arrays by name.
-    """
+    """An hloc file: images are the groups that hold datasets; `entries` are the places of their arrays by name."""
 
     transposed = True  # descriptors are `[D, N]` if their shapes fit both layouts
 
@@ -212,9 +209,6 @@ def _h5py(path: Path) -> Any:
     except ImportError:
         raise InputError(f"{path}: HDF5 needs the package h5py; pip install 'mfvpr[hloc]'") from None
     return h5py
-
-
-# --- names of images -----------------------------------------------------------------------------------------------
 
 
 def match_names(path: Path, names: Sequence[str], foreign: Iterable[str]) -> list[str | None]:

@@ -36,10 +36,8 @@ class Images(NamedTuple):
 class ImportedMatches:
     """Matches in files of another program, made by `open_matches`.
 
-    Attributes:
-        path: file or folder.
-        names: names in the file of queries and database images; None = the file lacks the image.
-        numbered: whether matches have numbers of keypoints.
+    `names` are those of queries and of database images in the file; None = it lacks the image. `numbered` tells whether
+    matches have numbers of keypoints.
     """
 
     def __init__(

@@ -1,7 +1,7 @@
 """Files with matches of image pairs: hloc's HDF5, COLMAP's databases, kapture's folders, folders of results.
 
 Results are a file for each pair (`.npz`, vismatch's `.torch`), or a `.torch` file of To-Match beside each text file of
-predictions that VPR-methods-evaluation writes. PyTorch is not needed.
+VPR-methods-evaluation's predictions.
 """
 
 import sqlite3
@@ -58,7 +58,7 @@ class PairFiles:
 
 def open_pairs(path: Path, names: tuple[Sequence[str], Sequence[str]], verified: bool = False) -> PairFiles:
     """Matches of the queries and database images `names`; only those that fit a geometric model if `verified`."""
-    if path.is_dir() and has_results(path):
+    if any(file.with_suffix(".txt").exists() for file in path.glob("*.torch")):  # To-Match's, beside predictions
         return open_predictions(path, verified)
     if path.is_dir() and not is_kapture(path):
         return open_results(path, names, verified)
@@ -74,9 +74,6 @@ def open_pairs(path: Path, names: tuple[Sequence[str], Sequence[str]], verified:
 def content_paths(path: Path) -> list[Path]:
     """Files and folders that decide the matches in `path`, without links."""
     return [each.resolve() for each in (kapture_folders(path) if path.is_dir() and is_kapture(path) else [path])]
-
-
-# --- hloc --------------------------------------------------------------------------------------------------------
 
 
 def open_hloc(path: Path) -> PairFiles:
@@ -120,8 +117,6 @@ def open_hloc(path: Path) -> PairFiles:
     return PairFiles(path, places, read, by_number, spelling=spelling)
 
 
-# --- COLMAP ------------------------------------------------------------------------------------------------------
-
 _MOST_IMAGES = 2**31 - 1  # the number of a pair is this times the number of the first image plus the other
 
 
@@ -141,7 +136,7 @@ def open_colmap(path: Path, verified: bool = False) -> PairFiles:
     }
 
     def matrix(table: str, column: str, number: int, dtype: str) -> Num[np.ndarray, "rows columns"]:
-        """The matrix of a row `(rows, cols, data)` of a table, of 2 or more columns; without a row, it is empty."""
+        """The matrix of a row of a table, of 2 or more columns; without a row, it is empty."""
         query = f"SELECT rows, cols, data FROM {table} WHERE {column} = ?"
         with _open_database(path) as database:
             rows, columns, content = database.execute(query, (number,)).fetchone() or (0, 2, b"")
@@ -176,8 +171,6 @@ def _open_database(path: Path) -> Iterator[sqlite3.Connection]:
         database.execute("PRAGMA trusted_schema = OFF")
         yield database
 
-
-# --- kapture -----------------------------------------------------------------------------------------------------
 
 _KAPTURE = Path("reconstruction/matches")
 _NUMBERS = {"float32": "<f4", "float64": "<f8", "float": "<f8"}  # types of keypoints
@@ -232,8 +225,6 @@ def open_kapture(path: Path) -> PairFiles:
     return PairFiles(path, places, read, keypoints=lambda image: matrix(features / f"{image}.kpt", dtype, width)[:, :2])
 
 
-# --- results -----------------------------------------------------------------------------------------------------
-
 QUERY, PREDICTIONS, POSITIVES = "Query path:", "Predictions paths:", "Positives paths:"  # headings
 _NAMES = ("img0_path", "img1_path")  # vismatch's
 _LAYOUTS = (("points0", "points1", "confidence"), ("matched_kpts0", "matched_kpts1", "matched_confidences"))
@@ -271,11 +262,6 @@ def open_results(path: Path, names: tuple[Sequence[str], Sequence[str]], verifie
             yield _matches_of(file, result, verified)
 
     return PairFiles(path, places, read, by_number=False, sided=has_names == {False}, in_image_files=False)
-
-
-def has_results(folder: Path) -> bool:
-    """Whether a folder has To-Match's results beside predictions."""
-    return any(file.with_suffix(".txt").exists() for file in folder.glob("*.torch"))
 
 
 def open_predictions(path: Path, verified: bool = False) -> PairFiles:

@@ -1,8 +1,4 @@
-"""Read and write shortlists and rankings of other programs.
-
-Lists of image pairs are hloc's `query database` and kapture's `query, reference, score`. VPR-methods-evaluation writes
-a folder of predictions, a text file for each query. To-Match adds the results of an image matcher.
-"""
+"""Read and write shortlists of other programs: hloc, kapture, VPR-methods-evaluation, To-Match."""
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path

@@ -1,7 +1,4 @@
-"""Times and poses of images in text files (TUM's, KITTI's), and the trajectory of localized images.
-
-Times are whole nanoseconds: no time is rounded to a float.
-"""
+"""Times (whole nanoseconds) and poses of images in text files of TUM and KITTI, and trajectories of images."""
 
 import math
 import re

@@ -7,8 +7,8 @@
 
 Other processes may read a map while one process adds to it, and several threads may share one `Map`.
 
-Read first: map (localize one image, step by step: add a step to `Map._localize`; its confidence), map_images (settings
-and images of a map, and how they are added), predictions, route (a drive through a map).
+Read first: map (images of a map, how they are added, and how one is localized: add a step to `Map._localize`),
+query_steps, map_settings, predictions, route (a drive through a map).
 """
 
 import lazy_loader

@@ -2,67 +2,50 @@
 
 import json
 import math
+import os
+import shutil
+import threading
 import warnings
-from collections import defaultdict
-from collections.abc import Iterable, Mapping, Sequence
+from collections import OrderedDict
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import replace
-from functools import partial
 from pathlib import Path
 from typing import Any
 
 import jax
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool
 
-from mfvpr.core.batch import BIN_STEP, score_candidates
-from mfvpr.core.histogram import HistogramOfShifts
-from mfvpr.core.scorer import Scorer, fit_capacities, require_scores
-from mfvpr.core.types import Features, Matches, Shortlist
-from mfvpr.datasets.datasets import Dataset, GroundTruth, ImageFolder, image_folder
+from mfvpr.core.types import Features, Shortlist
+from mfvpr.datasets.datasets import GroundTruth, ImageFolder, image_folder
 from mfvpr.datasets.datasets import folder as folder_dataset
-from mfvpr.datasets.ground_truth import middle
-from mfvpr.evaluation.confidence import (
-    REFUSALS,
-    CalibrationData,
-    Confidence,
-    absent_ranking,
-    calibration_data,
-    confidence_from_json,
-)
-from mfvpr.evaluation.dataset_ranking import Reason, rank_dataset
-from mfvpr.evaluation.evidence import (
-    LEAST_STRENGTH,
-    evidence_against,
-    evidence_scores,
-    reason_against,
-    reason_against_image,
-)
+from mfvpr.evaluation.confidence import REFUSALS, Confidence, confidence_from_json
+from mfvpr.evaluation.dataset_ranking import Reason
+from mfvpr.evaluation.evidence import LEAST_STRENGTH, evidence_scores, reason_against, reason_against_image
 from mfvpr.evaluation.rankings import Ranked, rank_by_scores
-from mfvpr.evaluation.stages import pair_shifts, require_finite
 from mfvpr.evaluation.system import System, noise_images
-from mfvpr.features.feature_set import STEP, stack_features, strength
-from mfvpr.localization.map_images import Described, Image, MapImages, exclusive, fit_to_map, load, read_system
+from mfvpr.features.feature_set import SHARE, check_features, strength
+from mfvpr.features.vlad import Vlad, VladFitting
+from mfvpr.localization import map_settings, query_steps
 from mfvpr.localization.predictions import Alternative, Localization, Prediction
+from mfvpr.localization.query_steps import Described, Describing, Image
 from mfvpr.localization.route import Route
-from mfvpr.matchers.matcher import Matcher, match_pairs
+from mfvpr.storage.cache_files import pack_arrays, unpack_arrays
 from mfvpr.storage.feature_cache import FeatureCache
+from mfvpr.storage.maps import Entry, MapFile, check_entry
 from mfvpr.utils.compiled_programs import keep_compiled_programs
 from mfvpr.utils.errors import InputError
 from mfvpr.utils.fields import whole
-from mfvpr.utils.fingerprints import fingerprint, recipe_of
-from mfvpr.utils.numerics import available_cpus, knows_own_context, round_up
-from mfvpr.utils.runtime import DEFAULT_RUNTIME, Runtime, ordered_map
+from mfvpr.utils.files import canonical_name
+from mfvpr.utils.numerics import free_host_bytes
+from mfvpr.utils.runtime import DEFAULT_RUNTIME, Runtime
 
-Point = tuple[float, float]
-
-_PAIRS_AT_ONCE = 8  # a scorer takes the time of so many, also for a single image of a rare size
-_LEAST_SLOTS = 256  # of an image
-_USUAL = 10  # images with the shares of `REFUSALS`, that are added to those of a drive
-_LEAST_RANGE = 0.02  # of the confidence over a drive that tells correct from incorrect predictions
+_FIRST_ROWS = 1024  # of global descriptors; twice as many whenever they are full
 _ROWS = whole(0, 10**9)  # an argument that is a number of rows
 
 
-class Map(MapImages):
+class Map:
     """Images with their places in a folder, in which one image at a time is localized.
 
         street = Map.create("map", "day/", mfvpr.load_system("steering"))
@@ -95,13 +78,30 @@ class Map(MapImages):
             runtime: memory that features may take, progress, and messages.
 
         Raises:
-            InputError: a system that a map cannot use, a threshold without a confidence, a folder with a map that was
-                made with another system, or a new map of a system whose image size follows the images (`create`).
+            InputError: a system that a map cannot use, or another one than that of the folder's map; a threshold
+                without a confidence; a new map of a system whose image size follows the images (use `create`).
         """
-        super().__init__(Path(folder), fit_to_map(Path(folder), system, None, runtime.log), runtime)
+        self.system = map_settings.fit_to_map(Path(folder), system, None, runtime.log)
+        self.extractor, describer = map_settings.describers_of(self.system)
+        self.folder, self.candidates = Path(folder).absolute(), int(self.system.pipeline.candidates)
+        self._runtime, self._file, self._lock = runtime, MapFile(self.folder), threading.RLock()
+        self._parts = map_settings.parts_of(self.system)
+        self._is_checked = False  # whether the file is known to have these parts
+        self._fitting = describer if isinstance(describer, VladFitting) else None  # of a vocabulary
+        self._describing = None if isinstance(describer, VladFitting) else Describing(self.extractor, describer)
+        self._images, self._row_of_name = list[tuple[str, Any]](), dict[str, int]()  # (name, place)
+        self._counts, self._strengths = list[int](), [0.0]  # of keypoints, and sums of strengths of the first rows
+        self._vectors = np.zeros((0, 0), np.float32)  # `[rows and some more, D]`; NaN of an image without features
+        self._features = OrderedDict[int, Features]()  # of the recently used rows
+        self._free_bytes = SHARE * free_host_bytes() if runtime.memory is None else 1e9 * runtime.memory
+        self._noise_scores: dict[int, float] = {}  # by the number of rows
+        self._typical = self.extractor.scales[0].typical_count
+        self._matcher: Any = self.system.pipeline.matcher  # one that JAX compiles, see `describers_of`
+        self._final = self.system.final_scores[self.system.headline]  # the score that decides
+        self.refresh()
         if confidence is None and (part := self._file.part("confidence")):
             content = json.loads(part)
-            if content["system"] != _fingerprint(self.system):
+            if content["system"] != map_settings.system_fingerprint(self.system):
                 expected = "the confidence of this map's system, got that of another system or version"
                 raise InputError(f"{folder}: expected {expected}; calibrate again")
             confidence = confidence_from_json(content["confidence"])
@@ -109,18 +109,15 @@ class Map(MapImages):
             expected = "a number from 0 to 1, and a confidence as well, which gives probabilities; calibrate the map"
             raise InputError(f"threshold={threshold}: expected {expected}")
         self.confidence, self.threshold = confidence, threshold
-        self._noise_scores: dict[int, float] = {}  # by the number of rows
-        self._typical = self.extractor.scales[0].typical_count
-        self._matcher: Any = self.system.pipeline.matcher  # one that JAX compiles, see `describers_of`
         keep_compiled_programs()
 
     @classmethod
     def open(cls, folder: Path | str, *, threshold: float | None = None, runtime: Runtime = DEFAULT_RUNTIME) -> "Map":
-        """Open a map that `create` or `mfvpr map build` made, with the system and the confidence in its folder.
+        """Open a map that `create` or `mfvpr map build` made, with its system and confidence.
 
-        An `InputError` says that there is no map, or one with a system of your own: `Map(folder, system)` opens it.
+        An InputError if there is no map, or one with a system of your own: use `Map(folder, system)`.
         """
-        return cls(folder, read_system(Path(folder)), threshold=threshold, runtime=runtime)
+        return cls(folder, map_settings.read_system(Path(folder)), threshold=threshold, runtime=runtime)
 
     @classmethod
     def create(
@@ -136,7 +133,7 @@ class Map(MapImages):
         """Make a map of the images of a folder, or add those that it lacks; see `build` for the arguments."""
         images = images if isinstance(images, ImageFolder) else image_folder(images)
         warn = lambda line: runtime.log(f"warning: {line}")  # noqa: E731
-        known = cls(folder, fit_to_map(Path(folder), system, images, warn), runtime=runtime)
+        known = cls(folder, map_settings.fit_to_map(Path(folder), system, images, warn), runtime=runtime)
         if same := len({*known.names} & {*images.names}):
             fix = "make another map if their content is new"
             runtime.log(f"{folder}: has {same} of {len(images)} images already, by their names, and keeps them; {fix}")
@@ -154,17 +151,13 @@ class Map(MapImages):
         """Fit the confidence on a drive, and keep it in the folder of the map.
 
         It holds for drives like this one. Correct is a prediction within 2 frames, or 25 m. Each query counts once more
-        without the images of its place, as one of a place that the map does not show.
-
-        Args:
-            database: folder of images along a path, preferably another than that of the map.
-            queries: folder of images of the drive along this path.
-            ground_truth: see `mfvpr.datasets.folder`.
-            cache: keeps features.
+        without the images of its place, as one of a place that the map does not show. `database` is a folder of images
+        along a path, preferably another than that of the map, `queries` one of a drive along this path; for
+        `ground_truth`, see `mfvpr.datasets.folder`. The cache keeps features.
         """
         dataset = folder_dataset(database, queries, ground_truth=ground_truth)
-        self.confidence, data = fit_on_drive(dataset, self.system, cache)
-        if (of_system := _fingerprint(self.system)) is None:
+        self.confidence, data = map_settings.fit_on_drive(dataset, self.system, cache)
+        if (of_system := map_settings.system_fingerprint(self.system)) is None:
             warnings.warn("a part of the system names no `recipe`: the confidence is not kept on disk", stacklevel=2)
         else:
             content = {"system": of_system, "queries": len(data.correct), "absent_queries": data.num_absent}
@@ -176,7 +169,6 @@ class Map(MapImages):
         """Find where an image, a file or `[H, W, 3]` uint8 RGB, was taken; see `localize_with_evidence`."""
         return self.localize_with_evidence(image, recent=recent, route=route).prediction
 
-    @exclusive
     def localize_with_evidence(
         self, image: Image, *, recent: int = 0, before: int | None = None, route: Route | None = None
     ) -> Localization:
@@ -198,34 +190,33 @@ class Map(MapImages):
         if not isinstance(route, Route | None):
             raise InputError(f"route: expected Route(), the same for all images of a drive, got {route!r}")
         _ROWS.check("recent", recent)
-        (_ROWS | None).check("before", before)
-        self._refresh_images()
-        pixels, total = load(image), len(self)
-        described, resized = self.describing.pixels(pixels)
-        end = max(0, (total if before is None else min(int(before), total)) - int(recent))
-        localized = self._localize(described, end, pixels.shape[1::-1], reason_against_image(resized))
-        if route is None:
-            return localized
-        refusals = REFUSALS if self.confidence is None else self.confidence.refusals
-        located = route(localized.prediction, self.there[:end], refusals)
-        prediction = replace(localized.prediction, located=located)
-        if located is not None and located.row is None:
-            prediction = prediction.without_place("off the map")
-        return localized._replace(prediction=prediction)
+        _ROWS.check("before", 0 if before is None else before)
+        with self._lock:
+            self._refresh_images()
+            pixels, total = query_steps.load(image), len(self)
+            described, resized = self.describing.pixels(pixels)
+            end = max(0, (total if before is None else min(int(before), total)) - int(recent))
+            localized = self._localize(described, end, pixels.shape[1::-1], reason_against_image(resized))
+            if route is None:
+                return localized
+            refusals = REFUSALS if self.confidence is None else self.confidence.refusals
+            located = route(localized.prediction, self.there[:end], refusals)
+            prediction = replace(localized.prediction, located=located)
+            if located is not None and located.row is None:
+                prediction = prediction.without_place("off the map")
+            return localized._replace(prediction=prediction)
 
-    @exclusive
     def warm_up(self) -> None:
-        """Compile what `localize` needs for images with as many keypoints as those of the map, which stays as it is.
-
-        An empty map raises an `InputError`.
-        """
-        self._refresh_images()
-        self.describing.image(noise_images()[0])
-        rows = {padded_size(count, self._typical): row for row, count in enumerate(self._counts)}  # one of each size
-        images = self._read_features([*rows.values()])
-        for row, features in zip(rows.values(), images, strict=True):  # its own best candidate: nothing is left out
-            match_and_score(features, images, self._matcher, self.system.scorers, self._typical)
-            self._localize((features, self._vectors[row]), len(self), self.extractor.image_size, None)
+        """Compile what `localize` needs for images like those of the map; an InputError for an empty map."""
+        with self._lock:
+            self._refresh_images()
+            self.describing.image(noise_images()[0])
+            # A row of each size; it is its own best candidate, so nothing is left out.
+            rows = {query_steps.padded_size(count, self._typical): row for row, count in enumerate(self._counts)}
+            images = self._read_features([*rows.values()])
+            for row, features in zip(rows.values(), images, strict=True):
+                query_steps.match_and_score(features, images, self._matcher, self.system.scorers, self._typical)
+                self._localize((features, self._vectors[row]), len(self), self.extractor.image_size, None)
 
     def _refresh_images(self) -> None:
         self.refresh()
@@ -237,23 +228,25 @@ class Map(MapImages):
         features, vector = described
         if end and strength(features) < LEAST_STRENGTH * self._strengths[end] / end:
             reason = "too few features"
-        rows, similarities = self._vectors.nearest(vector, self.candidates, before=end)
+        rows, similarities = query_steps.nearest(self._vectors[:end], vector, self.candidates)
         if reason is None and not len(rows):
             reason = "no candidates"
         if reason is not None:
             return Localization(Prediction(reason=reason, image_width=size[0]), described, None)
         candidates = self._read_features(rows.tolist())
-        matches, scores = match_and_score(features, candidates, self._matcher, self.system.scorers, self._typical)
+        matches, scores = query_steps.match_and_score(
+            features, candidates, self._matcher, self.system.scorers, self._typical
+        )
         ranking = self._rank(rows, similarities, scores)
         best = matches[int(np.flatnonzero(rows == ranking.rows[0, 0])[0])]
         if reason := reason_against(best.mask.sum(), evidence_scores(best)[0], self._noise_score(end)):
             return Localization(Prediction(reason=reason, image_width=size[0]), described, None)
         p = math.nan if self.confidence is None else float(self.confidence(ranking)[0])
         alternatives = tuple(
-            Alternative(row, self._names[row], self._places[row], score)
+            Alternative(row, *self._images[row], score=score)
             for row, score in zip(ranking.rows[0].tolist(), ranking.scores[0].tolist(), strict=True)
         )
-        top, shift = alternatives[0], shift_of(self.system.scorers.values(), best, size)
+        top, shift = alternatives[0], query_steps.shift_of(self.system.scorers.values(), best, size)
         confidence = None if math.isnan(p) else p  # without a finite score
         prediction = Prediction(top.place, alternatives, top.score, confidence, *shift, image_width=size[0])
         if self.threshold is not None and not p >= self.threshold:
@@ -267,9 +260,9 @@ class Map(MapImages):
             scores = [0.0]
             for image in noise_images(self.extractor.image_size):
                 features, vector = self.describing.image(image)
-                rows, _ = self._vectors.nearest(vector, self.candidates, before=end)
+                rows, _ = query_steps.nearest(self._vectors[:end], vector, self.candidates)
                 candidates = self._read_features(rows.tolist())
-                pairs, _ = match_and_score(features, candidates, self._matcher, {}, self._typical)
+                pairs, _ = query_steps.match_and_score(features, candidates, self._matcher, {}, self._typical)
                 scores += [float(evidence_scores(pair)[0]) for pair in pairs]
             self._noise_scores[end] = float(np.max(scores))
         return self._noise_scores[end]
@@ -279,115 +272,170 @@ class Map(MapImages):
         pad = lambda values, fill: np.pad(values, (0, self.candidates - len(values)), constant_values=fill)[None]  # noqa: E731
         shortlist = Shortlist(pad(rows, -1), pad(similarities, 0), pad(np.ones(len(rows), bool), False))
         padded_scores = {name: pad(values, np.nan) for name, values in scores.items()}
-        final = self.system.final_scores[self.system.headline]
-        [ranking] = rank_by_scores(shortlist, padded_scores, [final], self.system.ties).values()
+        [ranking] = rank_by_scores(shortlist, padded_scores, [self._final], self.system.ties).values()
         return Ranked(ranking.rows[:, : len(rows)], ranking.scores[:, : len(rows)])
 
+    def __len__(self) -> int:
+        """Number of images."""
+        return len(self._images)
 
-def match_and_score(
-    query: Features, candidates: Sequence[Features], matcher: Matcher, scorers: Mapping[str, Scorer], typical: int
-) -> tuple[list[Matches], dict[str, Float[np.ndarray, " candidates"]]]:
-    """Matches `[1, K, ...]` of an unpadded query with each candidate, and scores by name.
+    @property
+    def describing(self) -> Describing:
+        """The extractor and the describer of the images; raises `InputError` if the map has no vocabulary yet."""
+        if self._describing is None:
+            raise InputError(f"{self.folder}: this map has no vocabulary yet; `learn` it from some images first")
+        return self._describing
 
-    Images are padded to one of a few sizes by their own numbers of keypoints, so that no pair's result and time depend
-    on the other pairs. Each core takes a few pairs at a time, since the steps after a pair's product keep one core
-    busy. `typical` is a usual number of keypoints, or the detector's limit. An InputError if no score is finite.
-    """
-    padded_query = stack_features([query], padded_size(len(query.mask), typical), total=1)
-    by_size = defaultdict[int, list[int]](list)
-    for place, candidate in enumerate(candidates):
-        by_size[padded_size(len(candidate.mask), typical)].append(place)
-    parts = [
-        (size, places[start : start + _PAIRS_AT_ONCE])
-        for size, places in sorted(by_size.items(), reverse=True)
-        for start in range(0, len(places), _PAIRS_AT_ONCE)
-    ]
+    @property
+    def names(self) -> list[str]:
+        """Names of the images, in the order of their rows."""
+        return [*self._row_of_name]
 
-    def match_part(part: tuple[int, list[int]]) -> tuple[Matches, dict[str, np.ndarray]]:
-        size, places = part
-        images = stack_features([candidates[place] for place in places], size, total=_PAIRS_AT_ONCE)
-        pairs = np.stack([np.zeros(_PAIRS_AT_ONCE, np.int32), np.arange(_PAIRS_AT_ONCE, dtype=np.int32)], axis=1)
-        matches = match_pairs(padded_query, images, pairs, np.int32(len(places)), matcher)
-        scores = {name: score_candidates(scorer, matches) for name, scorer in scorers.items()}
-        for name, values in scores.items():
-            require_scores(type(scorers[name]).__name__, values, _PAIRS_AT_ONCE)
-        return jax.device_get((matches, {name: values.astype(np.float32) for name, values in scores.items()}))
+    @property
+    def there(self) -> Bool[np.ndarray, " rows"]:
+        """Which rows have an image: all."""
+        return np.ones(len(self), bool)
 
-    workers = min(available_cpus(), len(parts))
-    map_parts = partial(ordered_map, workers=workers) if workers > 1 and knows_own_context() else map
-    matches, scores = {}, {name: np.zeros(len(candidates), np.float32) for name in scorers}
-    for (_, places), (of_part, scores_of_part) in zip(parts, map_parts(match_part, parts), strict=True):
-        for number, place in enumerate(places):
-            matches[place] = jax.tree.map(lambda leaf: leaf[number : number + 1], of_part)  # noqa: B023
-        for name, values in scores_of_part.items():
-            scores[name][places] = values[: len(places)]
-    for name, values in scores.items():
-        require_finite(name, values)
-    return [matches[place] for place in range(len(candidates))], scores
+    def row(self, name: str) -> int | None:
+        """Row of an image; None = the map has no image of this name."""
+        return self._row_of_name.get(name)
 
+    def place(self, row: int) -> Any:
+        """Place of the image in a row."""
+        return self._images[row][1]
 
-def padded_size(count: int, typical: int) -> int:
-    """Slots for an image: `typical` rounded up, or a power of 2 from 256 on: few sizes, so few programs."""
-    size, typical = 1 << (max(count, _LEAST_SLOTS) - 1).bit_length(), round_up(typical, STEP)
-    return min(size, typical) if typical >= count else size
+    def refresh(self) -> int:
+        """Read and count the images that were added since; an InputError for other settings, or a damaged map."""
+        with self._lock:
+            before = len(self)
+            for part, now in () if self._is_checked else self._parts.items():
+                stored = json.loads(self._file.part(part) or b"{}")
+                if differing := " and ".join(name for name in stored if stored[name] != now.get(name)):
+                    fix = "Use what it was made with (`mfvpr map info`), or name another folder"
+                    raise InputError(f"{self.folder}: this map was made with other {differing}. {fix}.")
+                self._is_checked = bool(stored)  # the last part is in every map
+            if self._describing is None and (content := self._file.part("vocabulary")) is not None:
+                arrays = unpack_arrays(content)
+                self._describing = Describing(self.extractor, Vlad(arrays["centers"], float(arrays["power"])))
+            for entry, count, strength_sum in self._file.entries(before):
+                if len(self) == len(self._vectors):
+                    more = np.zeros((max(_FIRST_ROWS, len(self)), len(entry.vector)), np.float32)
+                    self._vectors = np.concatenate([self._vectors, more]) if len(self) else more
+                self._vectors[len(self)] = entry.vector if entry.vector.any() else np.nan
+                self._row_of_name[entry.name] = len(self)
+                self._images.append((entry.name, entry.place))
+                self._counts.append(count)
+                self._strengths.append(self._strengths[-1] + strength_sum)
+            return len(self) - before
 
+    def learn(self, images: ImageFolder, *, cache: FeatureCache | None = None) -> None:
+        """Learn the vocabulary from some images, unless the map has one; arguments and errors are those of `build`."""
+        with self._lock:
+            if self._describing is None:
+                with self._learned(images, cache):
+                    pass
 
-def shift_of(
-    scorers: Iterable[Scorer], pair: Matches, size: tuple[int, int]
-) -> tuple[Point | None, tuple[Point, Point] | None]:
-    """`shift` and `shift_interval` of a `Prediction` by the first histogram of shifts, from one pair.
+    def build(
+        self, images: ImageFolder, places: Sequence[Any] | None = None, *, cache: FeatureCache | None = None
+    ) -> int:
+        """Add the images whose names the map does not have yet; return how many were added.
 
-    Shifts of the resized images become px of the query image, whose size is (width, height).
-    """
-    scorer = next((scorer for scorer in scorers if isinstance(scorer, HistogramOfShifts)), None)
-    if scorer is None:
-        return None, None
-    histogram = fit_capacities(scorer, pair.image_size0, pair.image_size1, multiple=BIN_STEP)
-    shift, interval = (np.asarray(values)[0] for values in pair_shifts(histogram, pair))
-    stretch = np.divide(size, np.asarray(pair.image_size0)[0])
-    shift, interval = stretch * shift, stretch * interval
-    point, low, high = ((float(x), float(y)) if np.isfinite(x + y) else None for x, y in (shift, *interval))
-    return point, (low, high) if low and high else None
+        Args:
+            images: to add. If the map needs a vocabulary and has none, it is learned from them first.
+            places: of each image, JSON values; None = the names.
+            cache: keeps the features, so that images that it knows are not described again. Without one, the folder
+                takes twice the space until all images are added.
 
+        Raises:
+            InputError: an image cannot be read, another process adds, or the disk is full: what was added stays.
+        """
+        with self._lock:
+            places = images.names if places is None else places
+            if len(places) != len(images):
+                raise InputError(f"expected a place of each of {len(images)} images, got {len(places)}")
+            place_of = dict(zip(images.names, places, strict=True))
+            for name, place in place_of.items():
+                check_entry(name, place)
+            self.refresh()
+            if {*images.names} <= {*self._row_of_name}:  # also in a map that can only be read
+                return 0
+            with self._learned(images, cache) as cache:
+                before, names = len(self), tuple(name for name in images.names if name not in self._row_of_name)
+                for batch in self.describing.folder(replace(images, names=names), cache):
+                    entries = [Entry(names[row], place_of[names[row]], vector) for row, (_, vector) in batch.items()]
+                    self._add(entries, [features for features, _ in batch.values()])
+                return len(self) - before
 
-def fit_on_drive(dataset: Dataset, system: System, cache: FeatureCache | None) -> tuple[Confidence, CalibrationData]:
-    """Fit the confidence of the ranking that decides on a data set; also what it was fitted on.
+    def add(self, image: Image, place: Any, *, name: str | None = None) -> None:
+        """Add an image and its place, any JSON value; an array needs a name, that of a file is its absolute path.
 
-    Each query counts twice: as it is, and without the images of its place, see `calibration_data`.
-    """
-    truth, root, cache = dataset.only.truth, dataset.queries.root, cache or FeatureCache()
-    if truth is None:
-        raise InputError(f"{dataset.name}: expected a ground truth, which says what is correct, got none")
-    result, threshold = rank_dataset(dataset, system, cache=cache), middle(truth.thresholds())
-    [ranked] = result.systems[system.headline]
-    absent = absent_ranking(ranked, truth, threshold)
-    refused = []  # of the queries as they are, and without the images of their place
-    for rankings in (ranked, absent):
-        [reasons] = evidence_against(replace(result, systems={system.headline: [rankings]}), cache)
-        refused.append(np.array([reason is not None for reason in reasons]))
-    shown, has_absent = truth.positives(threshold).counts > 0, absent.rows[:, 0] >= 0
-    on, off = refused[0][shown], np.concatenate([refused[0][~shown], refused[1][has_absent]])
-    usual_on, usual_off = _USUAL * np.array(REFUSALS)
-    refusals = (on.sum() + usual_on) / (len(on) + _USUAL), (off.sum() + usual_off) / (len(off) + _USUAL)
-    data = calibration_data(ranked, truth, threshold)
-    confidence = replace(data.fit(), refusals=(float(refusals[0]), float(refusals[1])))
-    probabilities, reasons = confidence.probability(data.present), list[str]()
-    if not data.num_absent:
-        reason = "without the images of a query's place there are no candidates, so that places that the map does not"
-        reasons.append(f"{reason} show get too high a confidence")
-    if np.ptp(probabilities[np.isfinite(probabilities)]) < _LEAST_RANGE:
-        reason = f"scores do not tell correct predictions ({data.correct.sum()} of {len(data.correct)}) from incorrect"
-        reasons.append(f"{reason} ones, so that every image gets the same confidence")
-    for reason in reasons:
-        warnings.warn(f"{root}: {reason}; calibrate on a longer drive", stacklevel=3)
-    return confidence, data
+        Errors are those of `build`; also for a name that the map has, and for a map without its vocabulary.
+        """
+        with self._lock:
+            if name is None:
+                if not isinstance(image, str | os.PathLike):
+                    raise InputError("name: expected one for an image that is no file")
+                name = canonical_name(Path(image))
+            features, vector = self.describing.image(image)
+            self.add_described([Entry(name, place, vector)], [features])
 
+    def add_described(self, entries: Sequence[Entry], features: Sequence[Features]) -> None:
+        """Add images with features and global descriptors that `describing` has computed; errors are those of `add`."""
+        with self._lock:
+            for name, place, _ in entries:
+                check_entry(name, place)
+            self.describing  # noqa: B018  # raises without a vocabulary
+            with self._file.lock():
+                self.refresh()
+                self._add(entries, features)
 
-def _fingerprint(system: System) -> str | None:
-    """A hash of everything that scores depend on; None if a part has no recipe."""
-    pipeline = system.pipeline
-    parts = (pipeline.extractor, pipeline.retriever, pipeline.matcher, pipeline.candidates, dict(system.scorers))
-    try:
-        return fingerprint(recipe_of([*parts, dict(system.fused), system.ties, system.headline]))
-    except TypeError:
-        return None
+    def _add(self, entries: Sequence[Entry], features: Sequence[Features]) -> None:
+        """Check and add images within the lock."""
+        new_names, dimension = set[str](), self.extractor.scales[0].dimension
+        length = self._vectors.shape[1] or np.size(entries[0].vector)
+        for (name, _, vector), local in zip(entries, features, strict=True):
+            values = np.asarray(vector)
+            if values.shape != (length,) or values.dtype.kind not in "fiu" or not np.isfinite(values).all():
+                got = f"{list(values.shape)} {values.dtype}"
+                raise InputError(f"{name}: expected a descriptor [{length}] of finite numbers, got {got}")
+            check_features(local, f"{name}: features", unit_length=False)
+            if (got := np.shape(local.descriptors)[-1]) != dimension:
+                raise InputError(f"{name}: expected features of {dimension} dimensions, got {got}")
+            if name in self._row_of_name or name in new_names:
+                raise InputError(f"{name}: the map has an image of this name; choose another")
+            new_names.add(name)
+        self._write({}, [*zip(features, entries, strict=True)])
+
+    def _write(self, parts: dict[str, bytes], images: Sequence[tuple[Features, Entry]] = ()) -> None:
+        """Write parts and images, and settings first if the map is new; the lock is held."""
+        self.refresh()  # another process may have made the map meanwhile, with other settings
+        new = {} if self._is_checked else {name: json.dumps(part).encode() for name, part in self._parts.items()}
+        self._file.write(new | parts, images)
+        self.refresh()
+
+    @contextmanager
+    def _learned(self, images: ImageFolder, cache: FeatureCache | None) -> Iterator[FeatureCache]:
+        """Hold the lock, learn the vocabulary if it is missing, and yield a cache with its features."""
+        temporary = self.folder / ".features"  # stays if the process is interrupted: the next one goes on with it
+        with self._file.lock():
+            self.refresh()
+            cache = cache or FeatureCache(temporary, runtime=self._runtime)
+            if self._describing is None and self._fitting is not None:
+                vocabulary = self._fitting.fit(cache.local(images, self.extractor)[0])
+                arrays = {"centers": vocabulary.centers, "power": np.array(vocabulary.power)}
+                self._write({"vocabulary": pack_arrays(arrays)})
+            yield cache
+            shutil.rmtree(temporary, ignore_errors=True)
+
+    def _read_features(self, rows: Sequence[int]) -> list[Features]:
+        """Features `[n, ...]` of distinct rows, in their order, NumPy; the least recently used ones make room."""
+        bytes_of = lambda features: sum(leaf.nbytes for leaf in jax.tree.leaves(features))  # noqa: E731
+        for row, features in self._file.features([row for row in rows if row not in self._features]):
+            self._features[row] = features
+            self._free_bytes -= bytes_of(features)
+        for row in rows:
+            self._features.move_to_end(row)
+        read = [self._features[row] for row in rows]
+        while self._free_bytes < 0:
+            self._free_bytes += bytes_of(self._features.popitem(last=False)[1])
+        return read

@@ -6,7 +6,7 @@ from typing import Any, NamedTuple
 
 from mfvpr.core.types import Matches
 from mfvpr.evaluation.dataset_ranking import Reason
-from mfvpr.localization.map_images import Described
+from mfvpr.localization.query_steps import Described
 from mfvpr.utils.errors import InputError
 
 

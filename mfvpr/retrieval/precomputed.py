@@ -38,7 +38,6 @@ class File:
         object.__setattr__(self, "path", Path(self.path))  # recipes recognize files by this type
 
     def names(self, folder: ImageFolder) -> list[str]:
-        """Names of a folder's images in the file."""
         return [self.prefix + name for name in folder.names]
 
 
@@ -80,9 +79,8 @@ class DescriptorFiles(_FolderFiles):
     def shortlist(
         self, sequence: QuerySequence, database: ImageFolder, num_candidates: int, cache: FeatureCache
     ) -> RetrievalResult:
-        """See `Retriever`."""
-        database_vectors = cache.once("vectors", lambda: self._read(database), database, self)
-        search = cache.once("search", lambda: self.search.fit(database_vectors), database, self)
+        database_vectors = cache.recipes.once("vectors", lambda: self._read(database), database, self)
+        search = cache.recipes.once("search", lambda: self.search.fit(database_vectors), database, self)
         query_vectors = self._read(sequence.images)
         shortlist = search.shortlist(query_vectors, database_vectors, num_candidates, excluded=sequence.excluded)
         return RetrievalResult(shortlist, {}, {})
@@ -158,7 +156,6 @@ class MatchFiles:
         return "images"
 
     def open(self, queries: ImageFolder, database: ImageFolder) -> ImportedMatches:
-        """See `mfvpr.matchers.host_matcher.PairSource`."""
         file = _file_of(self.files, queries)
         known: ImageOfEntry = {}  # images of the entries of both folders
         sides = self._images(queries, file.prefix, known), self._images(database, self.database_prefix, known)

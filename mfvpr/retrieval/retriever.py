@@ -51,10 +51,9 @@ class Retrieval:
     def shortlist(
         self, sequence: QuerySequence, database: ImageFolder, num_candidates: int, cache: FeatureCache
     ) -> RetrievalResult:
-        """See `Retriever`."""
         database_vectors = cache.vectors(database, self.describer, database, label="database")
         query_vectors = cache.vectors(sequence.images, self.describer, database, label=f"query {sequence.name}")
-        search = cache.once("search", lambda: self.search.fit(database_vectors.values), database, self)
+        search = cache.recipes.once("search", lambda: self.search.fit(database_vectors.values), database, self)
         # An image without features has the descriptor 0, which is equally similar to all.
         is_zero = ~query_vectors.values.any(axis=1, keepdims=True)
         queries = np.where(is_zero, np.nan, query_vectors.values)
@@ -128,14 +127,12 @@ def vote(
 def fit_to_database(tool: Tool, database: ImageFolder, cache: FeatureCache) -> Tool:
     """Learn the parts of an extractor, a retrieval, or a dataclass of these that need a database.
 
-        cells = fit_to_database(SsmCells(model), database, cache)  # as `mfvpr.evaluate` does
-
     The cache stores learned parts, by the images' content and all settings. Parts that are learned already stay the
     same, even if from another database. Images that cannot be read or are too few raise an `InputError`.
     """
     if isinstance(tool, WindowExtractor) and isinstance(tool.whitening, WindowFitting):
         fitting = tool.whitening
-        whitening = cache.once("whitening", lambda: _whitening(tool, fitting, database, cache), database, tool)
+        whitening = cache.recipes.once("whitening", lambda: _whitening(tool, fitting, database, cache), database, tool)
         return replace(tool, whitening=whitening)  # pyright: ignore[reportArgumentType, reportCallIssue, reportReturnType]
     return with_parts(tool, lambda part: fit_to_database(part, database, cache))
 

@@ -16,8 +16,7 @@ from mfvpr.utils.errors import InputError
 from mfvpr.utils.numerics import as_array, at_least_single, compiled, device_of, free_bytes, masked, repeat_last
 
 SHARE = 1 / 16  # of the free memory, for the similarities that exist at the same time
-ROWS = 2**16  # database rows at a time on a CPU; fixed, because the last bits of the similarities depend on it
-ROWS_SHARE = 1 / 4  # of an accelerator's free memory, for the database rows there
+ROWS = 2**16  # database rows at a time; fixed, because the last bits of the similarities depend on it
 BLOCK = 128  # database rows, of which an accelerator first looks at the largest similarity
 MAX_SAMPLES = 4096  # descriptors, evenly spread over the database, that a whitening is learned from
 
@@ -32,8 +31,7 @@ class ExactSearch:
     Of equal descriptors in different blocks of 65,536 database rows, any may come first: last bits depend on the block.
     """
 
-    def fit(self, database: Database) -> "ExactSearch":
-        """Return itself: there is nothing to learn."""
+    def fit(self, database: Database) -> "ExactSearch":  # there is nothing to learn
         return self
 
     def shortlist(
@@ -43,13 +41,9 @@ class ExactSearch:
         if excluded is not None and (len(excluded), excluded.num_database) != (len(queries), len(database)):
             expected, got = f"{len(queries)} queries and {len(database)} images", len(excluded)
             raise InputError(f"excluded: expected rows of {expected}, got {got} and {excluded.num_database}")
-        device = device_of(())
-        num_rows = ROWS
-        if device.platform != "cpu":  # as many as fit, since every part costs a wait
-            num_rows = max(ROWS, int(ROWS_SHARE * free_bytes(device)) // (4 * database.shape[1]))
-        num_rows = min(len(database), num_rows)
+        num_rows = min(len(database), ROWS)
         # Queries at a time, at least 2, with similarities that fit: 8 bytes for one and its masked copy.
-        fitting = max(2, int(SHARE * free_bytes(device)) // 8 // num_rows)
+        fitting = max(2, int(SHARE * free_bytes(device_of(()))) // 8 // num_rows)
         chunk_size = -(-len(queries) // -(-len(queries) // fitting))
         shortlists: dict[int, Shortlist] = {}  # by the first query of a chunk
         for rows in _parts(len(database), num_rows):
@@ -91,7 +85,6 @@ class WhitenedSearch:
     def shortlist(
         self, queries: Queries, database: Database, num_candidates: int, *, excluded: Positives | None = None
     ) -> Shortlist:
-        """As `ExactSearch.shortlist`."""
         learned = self.whitening or self.fit(database).whitening
         assert learned is not None
         whiten = partial(_project, mean=learned.mean, components=learned.components)
@@ -141,16 +134,15 @@ def retrieve(
         shortlist = mfvpr.retrieve(query_descriptors, database_descriptors, num_candidates=50)
 
     Args:
-        query_descriptors: unit length.
-        database_descriptors: unit length. For several calls, put them on the device once (`jax.device_put`): with
-            NumPy's arrays every call copies them.
+        query_descriptors, database_descriptors: unit length. For several calls, put the database on the device once
+            (`jax.device_put`): NumPy's arrays are copied at every call.
         num_candidates: if there are fewer database images, the shortlist ends in -1.
         mask: False for database images that must not appear (for that query); another shape raises an `InputError`.
 
     Returns:
         Shortlist by descending cosine similarity; the first row wins a tie. A database image with a descriptor
-        that is not finite never appears; a query with a descriptor that is not finite has an empty shortlist. On a CPU
-        the scores of a query do not depend on the other queries, in any bit.
+        that is not finite never appears; a query with one has an empty shortlist. On a CPU the scores of a query do
+        not depend on the other queries, in any bit.
     """
     shapes = [(len(database_descriptors),), (len(query_descriptors), len(database_descriptors))]
     if mask is not None and mask.shape not in shapes:

@@ -50,27 +50,18 @@ Arrays = Mapping[str, np.ndarray]
 
 
 class CacheFiles(Generic[Item]):
-    """Items by key in the folder of one recipe, with the methods that a cache uses of a dictionary.
+    """Items by key in the folder of one recipe, with the methods that a cache uses of a dictionary."""
 
-    Attributes:
-        folder: absolute path; it is made when the first item is written.
-    """
+    compress = False
 
     def __init__(
-        self,
-        root: Path,
-        name: str,
-        recipe: Mapping[str, Any],
-        pack: Callable[[Item], Arrays],
-        unpack: Callable[[Arrays], Item],
-        *,
-        compress: bool = False,
+        self, root: Path, name: str, recipe: Mapping, pack: Callable[[Item], Arrays], unpack: Callable[[Arrays], Item]
     ) -> None:
         """Name the folder below `root` by a name and a recipe (JSON values); `pack` and `unpack` convert an item."""
         self._recipe = {"format": "mfvpr cache 2", "recipe": recipe}
         name = re.sub(r"[^A-Za-z0-9._-]", "_", name)[:100]
         self.folder = root.absolute() / f"{name}-{fingerprint(self._recipe)}"
-        self._pack, self._unpack, self._compress = pack, unpack, compress
+        self._pack, self._unpack = pack, unpack
 
     def path(self, key: str) -> Path:
         """The file of a key."""
@@ -96,7 +87,7 @@ class CacheFiles(Generic[Item]):
 
         def write(key: str) -> None:
             with replacing(self.path(key)) as temporary, temporary.open("wb") as file:
-                file.write(pack_arrays(packed[key], compress=self._compress))
+                file.write(pack_arrays(packed[key], compress=self.compress))
                 file.flush()
                 os.fsync(file.fileno())
 
@@ -113,9 +104,10 @@ class MatchStore(CacheFiles[QueryMatches], Sequence[Matches]):
     As a sequence, every access reads the Matches of a query, as in QueryMatches; slices are not supported.
     """
 
+    compress = True  # every candidate repeats points of the query: a match takes about 23 bytes instead of 32
+
     def __init__(self, root: Path, recipe: Mapping[str, Any], num_queries: int) -> None:
-        # Compressed, since every candidate repeats points of the query: a match takes about 23 bytes instead of 32.
-        super().__init__(root, "matches", recipe, pack_matches, unpack_matches, compress=True)
+        super().__init__(root, "matches", recipe, pack_matches, unpack_matches)
         self._rows = range(num_queries)
 
     @property

@@ -16,7 +16,7 @@ from functools import partial
 from itertools import islice
 from operator import itemgetter
 from pathlib import Path, PurePath
-from typing import Any, TypeVar
+from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -43,15 +43,14 @@ Value = TypeVar("Value")
 
 def states(folder: ImageFolder, rows: Iterable[int] | None = None) -> list[str]:
     """A text for each image, which changes with the file, or with the conversion of its pixels."""
-    how = folder.orient, folder.bits
     names = folder.names if rows is None else [folder.names[row] for row in rows]
     paths = (f"{folder.root}/{image}" for image in names)
-    return [f"{path} {state_of(path)} {how}" for path in paths]
+    return [f"{path} {state_of(path)} {folder.orient} {folder.bits}" for path in paths]
 
 
 @dataclass
 class Recipes:
-    """Recipes of a cache in the folder `root`, and results in memory; without a root, hashes of files stay there."""
+    """Recipes of a cache in the folder `root`, and results in memory; without a root, hashes of files as well."""
 
     root: Path | None
     _computed: dict[tuple, tuple[Any, Any]] = field(default_factory=dict, repr=False)
@@ -93,33 +92,21 @@ class Recipes:
         return self.of_features(extractor) | {"images": self.contents(folder).fingerprint}
 
 
-@dataclass(frozen=True)
-class Vectors:
-    """Global descriptors of all images of a folder.
+class Vectors(NamedTuple):
+    """Global descriptors of all images of a folder, float32."""
 
-    Attributes:
-        values: float32; NaN for bad images, which no shortlist contains.
-        bad: row -> reason, for images without a usable descriptor.
-    """
-
-    values: Float[np.ndarray, "_ dimensions"]
-    bad: Mapping[int, str]
+    values: Float[np.ndarray, "_ dimensions"]  # NaN for bad images, which no shortlist contains
+    bad: Mapping[int, str]  # row -> reason, for images without a usable descriptor
 
 
 @dataclass
 class Part:
-    """The global descriptors of a folder's images, or one scale of their local features; a source of features.
-
-    Attributes:
-        items: by key, in files or in memory.
-        keys: of the images.
-        counts: `[M]` keypoints of each image, 1 for a global descriptor; -1 = not looked at yet, or not there.
-    """
+    """The global descriptors of a folder's images, or one scale of their local features; a source of features."""
 
     folder: ImageFolder
-    items: CacheFiles[Any] | MutableMapping[str, Any]
-    keys: Sequence[str]
-    counts: np.ndarray
+    items: CacheFiles[Any] | MutableMapping[str, Any]  # by key, in files or in memory
+    keys: Sequence[str]  # of the images
+    counts: np.ndarray  # of keypoints, 1 for a global descriptor; -1 = not looked at yet, or not there
 
     def missing(self, rows: Iterable[int], warn: Callable[[str], object]) -> Iterator[int]:
         """Rows that are not here; `warn` gets a line for each damaged file."""
@@ -150,27 +137,19 @@ class Part:
         return ordered_map(self.items.get, (self.keys[row] for row in rows), workers=THREADS)
 
 
-@dataclass
-class Descriptions:
-    """Descriptions of a folder's images by one extractor.
-
-    Attributes:
-        vectors: the global descriptors; None if the extractor gives none.
-        local: scales of the local features.
-        states: of the files before they were hashed, see `states`.
-        bad: row -> reason, for images without a usable description.
-    """
+class Descriptions(NamedTuple):
+    """Descriptions of a folder's images by one extractor."""
 
     folder: ImageFolder
-    vectors: Part | None
-    local: list[Part]
-    states: Sequence[str]
-    bad: dict[int, str] = field(default_factory=dict)
+    vectors: Part | None  # global descriptors; None if the extractor gives none
+    local: list[Part]  # scales of the local features
+    states: Sequence[str]  # of the files before they were hashed, see `states`
+    bad: dict[int, str]  # row -> reason, for images without a usable description
 
     def write(self, batch: Mapping[int, Description | str]) -> None:
         """Write the descriptions of a batch, or why images have none."""
         described = {row: each for row, each in batch.items() if isinstance(each, Description)}
-        self.bad |= {row: each for row, each in batch.items() if isinstance(each, str)}
+        self.bad.update({row: each for row, each in batch.items() if isinstance(each, str)})
         if changed := [row for row in described if states(self.folder, [row]) != [self.states[row]]]:
             path = self.folder.paths[changed[0]]
             raise InputError(f"{path}: changed while it was described; run again when it is complete")
@@ -207,10 +186,6 @@ class FeatureCache:
         if self.root is None and self.runtime.cluster is not None:
             raise InputError("cluster: expected a cache with a root, a folder that all workers share")
 
-    def once(self, name: str, compute: Callable[[], Value], folder: ImageFolder, by: Any) -> Value:
-        """See `Recipes.once`."""
-        return self.recipes.once(name, compute, folder, by)
-
     def warn(self, line: str) -> None:
         """Log a warning, once: several sequences may share a database."""
         if line not in self._warned:
@@ -237,13 +212,13 @@ class FeatureCache:
     ) -> tuple[FeatureSet, ...]:
         """Local features by scale, to be read on demand, of all images or of those in `rows`.
 
-        `label` names the images in messages.
-
-        Raises:
-            InputError: an image cannot be read (unless `skip_bad`), or none can; or the disk cannot be used.
+        `label` names the images in messages. An InputError if an image cannot be read (unless `skip_bad`), or none can,
+        or if the disk cannot be used.
         """
         if isinstance(extractor, Source):
-            source = self.once("opened", lambda: extractor.open(folder, partial=self.skip_bad), folder, extractor)
+            source = self.recipes.once(
+                "opened", lambda: extractor.open(folder, partial=self.skip_bad), folder, extractor
+            )
             missing = np.flatnonzero(np.asarray(source.counts) < 0).tolist()
             return (FeatureSet(source, {row: f"{folder.paths[row]}: no features were imported" for row in missing}),)
         state = self._open(folder, extractor)
@@ -258,25 +233,11 @@ class FeatureCache:
         return np.stack([part.counts for part in parts])
 
     def vectors(
-        self,
-        folder: ImageFolder,
-        describer: Extractor | Aggregated,
-        database: ImageFolder,
-        *,
-        label: str = "image",
+        self, folder: ImageFolder, describer: Extractor | Aggregated, database: ImageFolder, *, label: str = "image"
     ) -> Vectors:
-        """Global descriptors of all images; an aggregation is fitted on the `database`.
-
-        `label` and errors are those of `local`.
-        """
-        if isinstance(describer, Aggregated):
-            compute = partial(self._aggregate, folder, describer, database, label)
-        elif describer.vector_size:
-            compute = partial(self._vectors, folder, describer, label)
-        else:
-            expected = "expected one that does, or Aggregated(extractor, VladFitting())"
-            raise InputError(f"{type(describer).__name__}: gives no global descriptor; {expected}")
-        return self.once("vectors", compute, folder, describer) if folder == database else compute()
+        """Global descriptors of all images; an aggregation is fitted on the `database`. Errors are those of `local`."""
+        compute = partial(self._compute_vectors, folder, describer, database, label)
+        return self.recipes.once("vectors", compute, folder, describer) if folder == database else compute()
 
     def _describe(
         self, state: Descriptions, extractor: Extractor, parts: Sequence[Part], rows: Iterable[int] | None, label: str
@@ -315,26 +276,29 @@ class FeatureCache:
 
             vectors = part("vector", lambda vector: {"vector": np.asarray(vector, np.float32)}, itemgetter("vector"))
             scales = (part(f"scale {at}", pack_features, unpack_features) for at in range(len(extractor.scales)))
-            return Descriptions(folder, vectors if extractor.vector_size else None, [*scales], before)
+            return Descriptions(folder, vectors if extractor.vector_size else None, [*scales], before, {})
 
-        return self.once("descriptions", open_parts, folder, extractor)
+        return self.recipes.once("descriptions", open_parts, folder, extractor)
 
-    def _vectors(self, folder: ImageFolder, describer: Extractor, label: str) -> Vectors:
-        state = self._open(folder, describer)
-        assert state.vectors is not None  # `vector_size` is above 0
-        self._describe(state, describer, [state.vectors], None, f"{label} descriptors")
-        values = np.full((len(folder), describer.vector_size), np.nan, np.float32)
-        for row, vector in state.vectors.read():
-            values[row] = np.reshape(vector, -1)
-        return Vectors(values, dict(state.bad))
-
-    def _aggregate(self, folder: ImageFolder, describer: Aggregated, database: ImageFolder, label: str) -> Vectors:
+    def _compute_vectors(
+        self, folder: ImageFolder, describer: Extractor | Aggregated, database: ImageFolder, label: str
+    ) -> Vectors:
+        if not isinstance(describer, Aggregated):
+            state = self._open(folder, describer)
+            if state.vectors is None:
+                expected = "expected one that does, or Aggregated(extractor, VladFitting())"
+                raise InputError(f"{type(describer).__name__}: gives no global descriptor; {expected}")
+            self._describe(state, describer, [state.vectors], None, f"{label} descriptors")
+            values = np.full((len(folder), describer.vector_size), np.nan, np.float32)
+            for row, vector in state.vectors.read():
+                values[row] = np.reshape(vector, -1)
+            return Vectors(values, dict(state.bad))
         [features] = self.local(folder, describer.extractor, label=label)
 
         def fit() -> Vlad:
             return describer.fitting.fit(*self.local(database, describer.extractor, label="database"))
 
-        aggregation = self.once("aggregation", fit, database, describer)
+        aggregation = self.recipes.once("aggregation", fit, database, describer)
         values = np.zeros((len(folder), aggregation.vector_size), np.float32)
         starts = range(0, len(folder), AGGREGATED)
         for start in self.runtime.progress(f"{label} descriptors")(starts, len(starts)):

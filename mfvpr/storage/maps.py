@@ -72,10 +72,7 @@ class MapFile:
         return None if row is None else row[0]
 
     def entries(self, start: int) -> Iterator[tuple[Entry, int, float]]:
-        """Entries of all rows from `start` on, in their order, with the number and the strength of their keypoints.
-
-        An InputError if one is damaged or missing.
-        """
+        """Entries of rows from `start` on, with number and strength of keypoints; an InputError if one is damaged."""
         query = "SELECT * FROM entries WHERE row >= ? ORDER BY row"
         with self._open() as database:
             rows: Iterable[Any] = database.execute(query, [start]) if database else ()

@@ -5,14 +5,14 @@ A choice that is named in a file is looked up here; nothing else can be made.
 
 import math
 import re
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, field, fields, replace
 from functools import cache
 from pathlib import Path
 from typing import Any, Literal
 
-from mfvpr import features
+from mfvpr import features, retrieval
 from mfvpr.baselines.learned_weight import SUFFIX, WORDS, named_weight
 from mfvpr.baselines.scorers import SCORERS
 from mfvpr.checkpoints import REGISTRY, load_model, own_entries
@@ -22,20 +22,9 @@ from mfvpr.core.weights import WEIGHTS
 from mfvpr.datasets import Dataset
 from mfvpr.evaluation import DriveFilter, FrameCorrelation, Fusion, Pipeline, System
 from mfvpr.evaluation.rankings import RetrievalScore, Ties
-from mfvpr.features import Aggregated, Extractor, Sift, VladFitting
 from mfvpr.features.whitening import WindowFitting
 from mfvpr.io.features import Lengths
 from mfvpr.matchers import LightGlueMatcher, Matcher, NearestNeighborMatcher
-from mfvpr.retrieval import (
-    DescriptorFiles,
-    FeatureFiles,
-    MatchFiles,
-    Retrieval,
-    Retriever,
-    ShortlistFiles,
-    SsmVoting,
-    WhitenedSearch,
-)
 from mfvpr.retrieval.precomputed import File
 from mfvpr.retrieval.search import EXACT
 from mfvpr.utils import recipe_of
@@ -90,6 +79,8 @@ NETWORKS = {  # class of mfvpr.features, which Flax makes slow to import, and we
     },
 }
 _WHITEN = "principal components that are kept, each of unit variance, fitted on the database; null = as they are"
+_WEIGHTS = "weights above 0 by name, such as {retrieval: 0.5, anchor: 1}"
+_LIST = "`mfvpr weights list` has all weights"
 _SHAPED = SIZE | whole(10_000, 4096**2) | "auto"  # a number of pixels; fewer than 10,000 are a side that was meant
 
 
@@ -123,62 +114,44 @@ def without(settings: Mapping[str, Any], *names: str) -> dict[str, Any]:
     return {name: value for name, value in settings.items() if name not in names}
 
 
-def _network_settings(group: str, name: str) -> dict[str, Any]:
-    """Settings of a network: of its weights, and of its extractor."""
-    owner, weights = NETWORKS[group][name]
-    known = settings_of(getattr(features, owner))
-    return {"weights": Setting(weights, TEXT, "`mfvpr weights list` has all weights"), **without(known, "whitening")}
-
-
-def _features() -> dict[str, dict[str, Any]]:
-    known = {"sift": without(settings_of(features.Sift), "batch_size")}
-    known |= {name: _network_settings("features", name) for name in NETWORKS["features"]}
-    known["ssm"] |= settings_of(WindowFitting)
-    for name in ("sift", "aliked", "d2net"):  # of images of any shape
-        known[name]["image_size"] = replace(known[name]["image_size"], rule=_SHAPED)
-    return {**known, "import": settings_of(_Files)}
-
-
-def _retrieval() -> dict[str, dict[str, Any]]:
-    files, known = settings_of(_Files), {name: _network_settings("retrieval", name) for name in NETWORKS["retrieval"]}
-    known |= {"vlad": settings_of(features.VladFitting), "same": {}, "import": without(files, "image_size")}
-    for name in ("gem", "dinov2"):
-        del known[name]["components"]
-    known["dinov2"] |= {
-        "image_size": Setting([224, 224], SIZE, "width, height, multiples of 14"),
-        "pooling": Setting("cls", one_of("cls", "gem"), "the class token, or the generalized mean of the patches'"),
-        "power": Setting(3.0, POSITIVE, "of the generalized mean: from the mean, 1, towards the maximum"),
-    }
-    for name in known.keys() - {"ssm"}:
-        known[name]["whiten"] = Setting(None, whole(1, 4096) | None, _WHITEN)
-    known["ssm"] |= settings_of(WindowFitting)
-    known["ssm"]["dimension"] = replace(known["ssm"]["dimension"], default=125)
-    return {**known, "pairs": without(files, "database", "lengths", "image_size")}
-
-
-def _matching() -> dict[str, dict[str, Any]]:
-    weights = Setting("aliked_lightglue", TEXT, "`mfvpr weights list` has all weights")
-    return {
-        "neighbors": settings_of(NearestNeighborMatcher),
-        "lightglue": {"weights": weights, **settings_of(LightGlueMatcher)},
-        "import": settings_of(_Matches),
-    }
-
-
-def _scorers() -> dict[str, dict[str, Any]]:
-    """Settings of each scorer; a match weight may also be one that is named, or a file."""
-    all_known = {name: settings_of(scorer) for name, scorer in SCORERS.items()}
-    rule = one_of(*WORDS) | text(f"(?s).*{SUFFIX}", f"a file that ends in {SUFFIX}")
-    for known in all_known.values():
-        if "weight" in known:
-            known["weight"] = replace(known["weight"], rule=rule, note="a list: a scorer of each")
-    return all_known
-
-
 @cache
 def choices_of(group: str) -> dict[str, dict[str, Any]]:
     """Settings of a group by choice and name. `name` in a group's settings, or `method` of a scorer, is the choice."""
-    return {"features": _features, "retrieval": _retrieval, "matching": _matching, "scorer": _scorers}[group]()
+    known, files = dict[str, dict[str, Any]](), settings_of(_Files)
+    for name, (owner, weights) in NETWORKS.get(group, {}).items():
+        known[name] = {"weights": Setting(weights, TEXT, _LIST)} | without(
+            settings_of(getattr(features, owner)), "whitening"
+        )
+    if "ssm" in known:
+        known["ssm"] |= settings_of(WindowFitting)
+    if group == "features":
+        known = {"sift": without(settings_of(features.Sift), "batch_size"), **known, "import": files}
+        for name in ("sift", "aliked", "d2net"):  # of images of any shape
+            known[name]["image_size"] = replace(known[name]["image_size"], rule=_SHAPED)
+    elif group == "retrieval":
+        known |= {"vlad": settings_of(features.VladFitting), "same": {}, "import": without(files, "image_size")}
+        for name in ("gem", "dinov2"):
+            del known[name]["components"]
+        known["dinov2"] |= {
+            "image_size": Setting([224, 224], SIZE, "width, height, multiples of 14"),
+            "pooling": Setting("cls", one_of("cls", "gem"), "the class token, or the generalized mean of the patches'"),
+            "power": Setting(3.0, POSITIVE, "of the generalized mean: from the mean, 1, towards the maximum"),
+        }
+        for name in known.keys() - {"ssm"}:
+            known[name]["whiten"] = Setting(None, whole(1, 4096) | None, _WHITEN)
+        known["ssm"]["dimension"] = replace(known["ssm"]["dimension"], default=125)
+        known["pairs"] = without(files, "database", "lengths", "image_size")
+    elif group == "matching":
+        lightglue = {"weights": Setting("aliked_lightglue", TEXT, _LIST), **settings_of(LightGlueMatcher)}
+        matches = settings_of(_Matches)
+        known = {"neighbors": settings_of(NearestNeighborMatcher), "lightglue": lightglue, "import": matches}
+    else:
+        known = {name: settings_of(scorer) for name, scorer in SCORERS.items()}
+        rule = one_of(*WORDS) | text(f"(?s).*{SUFFIX}", f"a file that ends in {SUFFIX}")
+        for each in known.values():
+            if "weight" in each:  # also one that is named, or a file
+                each["weight"] = replace(each["weight"], rule=rule, note="a list: a scorer of each")
+    return known
 
 
 def by_scorer(settings: Mapping[str, Any]) -> Mapping[str, Any]:
@@ -198,10 +171,6 @@ def _check_choice(group: str, prefix: str, values: Any) -> None:
     check_values(known, without(values, key), f"{prefix}.")
 
 
-def _is_weights(value: Any) -> bool:
-    return value is None or (isinstance(value, Mapping) and all(map(POSITIVE.holds, value.values())))
-
-
 @dataclass(frozen=True)
 class FusionSettings:
     """Fusion of scores with that of the retrieval."""
@@ -209,12 +178,11 @@ class FusionSettings:
     c: float | str = setting(
         "auto",
         NOT_NEGATIVE | one_of("auto", "zscore"),
-        "s = c * retrieval + score (the paper: about 1e6 with D2-Net's scores); auto = equal spread per query; zscore: "
-        "scores are standardized over the candidates of each query and added",
+        "s = c * retrieval + score; auto = equal spread per query; zscore = standardized scores are added",
     )
     weights: Any = setting(
         None,
-        Rule(_is_weights, "weights above 0 by name, such as {retrieval: 0.5, anchor: 1}, or null"),
+        Rule(lambda value: isinstance(value, Mapping) and all(map(POSITIVE.holds, value.values())), _WEIGHTS) | None,
         "of zscore, 1 each: {retrieval: 0.5, anchor: 1} adds the score of anchor",
     )
     retrieval_score: RetrievalScore = setting("cosine", word_of(RetrievalScore))
@@ -230,12 +198,12 @@ class SystemSettings:
     retrieval: Mapping[str, Any] = group()
     matching: Mapping[str, Any] = group()
     scorer: Mapping[str, Any] = group()
-    candidates: int | Literal["all"] = setting(
-        50, COUNT | "all", "number of database images that are re-ranked per query, or all"
-    )
+    candidates: int | Literal["all"] = setting(50, COUNT | "all", "database images that are re-ranked per query")
     fusion: FusionSettings = field(default=FusionSettings())
     final: str = setting("score", one_of("score", "combined"), "what decides: the score, or combined with retrieval")
     ties: Ties = setting("retrieval", word_of(Ties), "equal scores keep the order of retrieval, or of the database")
+    previous_queries: int = 0  # only of evaluations, as is the next
+    sequence: Any = None
 
     def __post_init__(self) -> None:
         """Raise an InputError for settings that are not allowed, by themselves or together."""
@@ -244,70 +212,67 @@ class SystemSettings:
             _check_choice(name, name, getattr(self, name))
         for name, values in by_scorer(self.scorer).items():
             _check_choice("scorer", "scorer" if "method" in self.scorer else f"scorer.{name}", values)
-        local, sides = self.features, self.features["image_size"]
+        local = self.features
         if self.scorer.get("method") == "grid":  # which takes the cells of features in a square grid
             if local["name"] not in ("ssm", "import") and self.matching["name"] != "import":
                 raise InputError(f"scorer=grid: expected features=ssm, whose features are cells, got {local['name']}")
             check = self.matching.get("cross_check", self.matching["name"])
             if check != "candidate":
                 raise InputError(f"matching.cross_check={check}: expected candidate, so that every cell has a match")
-            cells = [(-(-pixels // 8) - 3) // local.get("stride", 1) + 1 for pixels in sides or []]
-            if local["name"] == "ssm" and cells != [self.scorer["side"]] * 2:
-                expected = f"the {cells[0]} x {cells[1]} cells of features.image_size={sides}"
-                raise InputError(f"scorer.side={self.scorer['side']}: expected {expected}")
         if local["name"] == "patch_netvlad":  # of whose patches the scorer `rapid` takes the largest place
+            sides = local["image_size"]
             largest = [[16 * (pixels // 16 - patch) for pixels in sides] for patch in local["patch_sizes"]]
             for values in by_scorer(self.scorer).values():
                 size = values.get("size")
                 if size is not None and [[*size]] != largest:
-                    expected = f"{largest[0]}, the largest place of these patches, or null"
-                    raise InputError(f"scorer.size={size}: expected {expected}")
+                    raise InputError(f"scorer.size={size}: expected the patches' largest place, {largest[0]}, or null")
 
 
 # --- the parts of a system, by fixed tables: nothing named in a YAML file is called ---------------------------------
 
 
-def extractor(settings: Mapping[str, Any], data: Dataset | None) -> Extractor | FeatureFiles:
+def extractor(settings: Mapping[str, Any], data: Dataset | None) -> features.Extractor | retrieval.FeatureFiles:
     """The extractor of local features, or the feature files of another program."""
     name, options = settings["name"], without(settings, "name", "image_size")
     size = tuple(settings["image_size"]) if isinstance(settings["image_size"], list) else None
     if name == "import":
-        return FeatureFiles(_files("features", options, data), options["lengths"], size)
+        return retrieval.FeatureFiles(_files("features", options, data), options["lengths"], size)
     if size is not None:  # else the extractor's own, until images decide
         options["image_size"] = size
     if name != "sift":
         return _network_extractor("features", name, options)
     if (kind := options["interpolation"]).startswith("torch"):
         raise InputError(f"features.interpolation={kind}: gives fractions, but SIFT takes whole numbers")
-    return Sift(**options)
+    return features.Sift(**options)
 
 
-def retriever(settings: Mapping[str, Any], local: Extractor | FeatureFiles, data: Dataset | None) -> Retriever:
+def retriever(
+    settings: Mapping[str, Any], local: features.Extractor | retrieval.FeatureFiles, data: Dataset | None
+) -> retrieval.Retriever:
     """The retrieval of candidates; VLAD aggregates the local features that are matched as well."""
     name, options = settings["name"], without(settings, "name", "whiten")
     if name == "pairs":
-        return ShortlistFiles(_files("retrieval", {"database": None, **settings}, data), settings["database_prefix"])
+        return retrieval.ShortlistFiles(
+            _files("retrieval", {"database": None, **settings}, data), settings["database_prefix"]
+        )
     if name == "ssm":
-        return SsmVoting(_network_extractor("retrieval", name, options))
-    search = EXACT if settings["whiten"] is None else WhitenedSearch(settings["whiten"])
+        return retrieval.SsmVoting(_network_extractor("retrieval", name, options))
+    search = EXACT if settings["whiten"] is None else retrieval.WhitenedSearch(settings["whiten"])
     if name == "import":
-        return DescriptorFiles(_files("retrieval", options, data), options["lengths"], search)
+        return retrieval.DescriptorFiles(_files("retrieval", options, data), options["lengths"], search)
     if name == "vlad":
-        return Retrieval(Aggregated(local, VladFitting(**options)), search)
+        return retrieval.Retrieval(features.Aggregated(local, features.VladFitting(**options)), search)
     if name != "same":
-        return Retrieval(_network_extractor("retrieval", name, options), search)
-    if isinstance(local, FeatureFiles) or not local.vector_size:
-        expected = "features with a global descriptor, such as patch_netvlad, selavpr or dinov2"
-        raise InputError(f"retrieval=same: expected {expected}; choose another retrieval")
-    return Retrieval(local, search)
+        return retrieval.Retrieval(_network_extractor("retrieval", name, options), search)
+    if isinstance(local, retrieval.FeatureFiles) or not local.vector_size:
+        raise InputError("retrieval=same: expected features with a global descriptor, such as selavpr or dinov2")
+    return retrieval.Retrieval(local, search)
 
 
 def _network_extractor(group: str, name: str, settings: Mapping[str, Any]) -> Any:
     """An extractor with a network; the settings are of its fields, of its network, and of its fitting."""
     extractor_class: Any = getattr(features, NETWORKS[group][name][0])
-    options: dict[str, Any] = {
-        key: tuple(value) if isinstance(value, list) else value for key, value in settings.items()
-    }
+    options: Any = {key: tuple(each) if isinstance(each, list) else each for key, each in settings.items()}
     networks = ("netvlad", "patch_netvlad") if name == "netvlad" else (name,)
     model = _network(group, networks, options["weights"])
     if "pooling" in options:
@@ -330,7 +295,7 @@ def _network(group: str, names: tuple[str, ...], weights: str) -> Any:
     return load_model(weights)
 
 
-def matcher(settings: Mapping[str, Any], data: Dataset | None) -> Matcher | MatchFiles:
+def matcher(settings: Mapping[str, Any], data: Dataset | None) -> Matcher | retrieval.MatchFiles:
     """The matcher of an image pair, or the match files of another program."""
     if settings["name"] == "neighbors":
         return NearestNeighborMatcher(**without(settings, "name"))
@@ -339,7 +304,7 @@ def matcher(settings: Mapping[str, Any], data: Dataset | None) -> Matcher | Matc
         return LightGlueMatcher.of(model, **without(settings, "name", "weights"))
     queries = settings["query_features"] or settings["features"]
     feature_files = {**settings, "database": settings["features"], "queries": queries}
-    return MatchFiles(
+    return retrieval.MatchFiles(
         _files("matching", {"database": None, "queries": settings["matches"], **settings}, data),
         settings["database_prefix"],
         {} if queries is None else _files("matching", feature_files, data),
@@ -354,9 +319,7 @@ def _files(group: str, settings: Mapping[str, Any], data: Dataset | None) -> dic
         raise InputError(f"{group}: files of other programs belong to a data set; choose others")
     queries = settings["queries"] if isinstance(settings["queries"], list) else [settings["queries"]]
     if len(queries) not in (1, count := len(data.sequences)):
-        raise InputError(
-            f"{group}.queries: expected one file, or one for each of {count} sequences, got {len(queries)}"
-        )
+        raise InputError(f"{group}.queries: expected one file, or one per sequence ({count}), got {len(queries)}")
     files = {}
     if settings["database"] is not None:
         files[data.database.root] = File(expand_user(settings["database"]), settings["database_prefix"])
@@ -364,8 +327,9 @@ def _files(group: str, settings: Mapping[str, Any], data: Dataset | None) -> dic
         root, path = sequence.images.root, expand_user(queries[index if len(queries) > 1 else 0])
         file = File(path, settings["query_prefix"])
         if files.setdefault(root, file) != file:
-            same = f"since the queries and the database are one folder, {root}"
-            raise InputError(f"{group}.queries={path}: expected the file and the prefix of {group}.database, {same}")
+            raise InputError(
+                f"{group}.queries={path}: expected the file and the prefix of {group}.database, as of {root}"
+            )
     return files
 
 
@@ -374,22 +338,20 @@ def pipeline(settings: SystemSettings, data: Dataset | None) -> Pipeline:
     with in_group("features", settings.features):
         local = extractor(settings.features, data)
     with in_group("retrieval", settings.retrieval):
-        retrieval = retriever(settings.retrieval, local, data)
+        finder = retriever(settings.retrieval, local, data)
     with in_group("matching", settings.matching):
         match = matcher(settings.matching, data)
     size = settings.features["image_size"]
     pixels = math.prod(local.image_size or ()) if size == "auto" else size if isinstance(size, int) else None
-    return Pipeline(local, retrieval, match, settings.candidates, pixels)
+    return Pipeline(local, finder, match, settings.candidates, pixels)
 
 
-def system(settings: SystemSettings, previous_queries: int = 0, sequence: str | Sequence[str] | None = None) -> System:
-    """The system that the settings name, without files of other programs; further arguments as of `rankings`."""
-    return System(pipeline(settings, None), **rankings(settings, previous_queries, sequence))
+def system(settings: SystemSettings) -> System:
+    """The system that the settings name, without files of other programs."""
+    return System(pipeline(settings, None), **rankings(settings))
 
 
-def rankings(
-    settings: SystemSettings, previous_queries: int = 0, sequence: str | Sequence[str] | None = None
-) -> dict[str, Any]:
+def rankings(settings: SystemSettings) -> dict[str, Any]:
     """All of a system but its pipeline: the main scorer is fused with the retrieval.
 
     The ranking that decides is also made with the places of previous queries, and of the queries as a sequence.
@@ -402,13 +364,14 @@ def rankings(
     with in_group("fusion", ("c", "weights", "retrieval_score")):
         fusion.check(main, tuple(chosen))
     headline = fusion.system(main) if settings.final == "combined" else main
+    sequence, previous = settings.sequence, settings.previous_queries
     methods: list[Any] = [sequence] if isinstance(sequence, str) else [*(sequence or ())]
     if len({*methods}) < len(methods):
         raise InputError(f"sequence=[{','.join(methods)}]: expected every method once")
     return {
         "scorers": chosen,
         "fused": {main: fusion},
-        "correlated": {headline: FrameCorrelation(previous_queries)} if previous_queries else {},
+        "correlated": {headline: FrameCorrelation(previous)} if previous else {},
         "ties": settings.ties,
         "sequences": {headline: tuple(map(DriveFilter, methods))} if methods else {},
         "final": headline,
@@ -431,24 +394,22 @@ def expand_weights(settings: Mapping[str, Any]) -> dict[str, Mapping[str, Any]]:
 
 def describe_settings(settings: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
     """Settings of the scorers by name, with the content of a learned match weight, since its file may change."""
-    return {
-        name: {**values, "weight_content": fingerprint(recipe_of(named_weight(values["weight"])))}
-        if values.get("weight", "fs") not in WEIGHTS
-        else {**values}
-        for name, values in expand_weights(settings).items()
-    }
+    described = {name: {**values} for name, values in expand_weights(settings).items()}
+    for values in described.values():
+        if values.get("weight", "fs") not in WEIGHTS:
+            values["weight_content"] = fingerprint(recipe_of(named_weight(values["weight"])))
+    return described
 
 
 def scorers(settings: Mapping[str, Any]) -> dict[str, Scorer]:
     """The chosen scorer, or several, by name: a weight is a word, null is no limit, a list a tuple of numbers."""
     scorers = {}
     for name, values in expand_weights(settings).items():
-        scorer, plain = SCORERS[values["method"]], without(values, "method")
-        known = parameters_of(scorer)
-        options: dict[str, Any] = {
-            field: named_weight(value) if field == "weight" else known[field].value(value)
-            for field, value in plain.items()
-        }
+        scorer = SCORERS[values["method"]]
+        known, plain = parameters_of(scorer), without(values, "method")
+        options: dict[str, Any] = {field: known[field].value(value) for field, value in plain.items()}
+        if "weight" in options:
+            options["weight"] = named_weight(values["weight"])
         with in_group("scorer" if name == values["method"] else f"scorer.{name}", values):
             scorers[name] = scorer(**options)
     return scorers

@@ -310,7 +310,7 @@ def _files(
     fusion = f"scales of {match_set.weights}" if isinstance(match_set, Scales) else "one scale"
     recipe["data"] = content_hash(fusion, [scale.fingerprint for scale in scales(match_set)], candidates, views)
     pack, unpack = lambda rows: {"rows": rows}, itemgetter("rows")
-    return CacheFiles(options.folder, "sweep", recipe, pack, unpack, compress=True), keys
+    return CacheFiles(options.folder, "sweep", recipe, pack, unpack), keys
 
 
 class Verdict(NamedTuple):

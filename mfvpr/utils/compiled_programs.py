@@ -26,10 +26,9 @@ def keep_compiled_programs(warn: Callable[[str], object] = warnings.warn) -> Non
     """Let JAX read compiled programs from disk, and write new ones there, for the rest of this process.
 
     They lie in a subfolder of `$MFVPR_CACHE/compiled`, by default `~/.cache/mfvpr/compiled`, for each processor and
-    version: they hold machine code for one processor, and the folder may be copied. Delete it at any time.
-    Where it cannot be written, it is only read. Nothing changes with `MFVPR_COMPILED=false`, without a home folder or
-    `MFVPR_CACHE`, or if JAX has a folder of its own (`jax_compilation_cache_dir`) or no compilation cache. A folder
-    that another user owns (except root) or can write to is not used, and `warn` gets a line once.
+    version. Where it cannot be written, it is only read. Nothing changes with `MFVPR_COMPILED=false`, without a home
+    folder or `MFVPR_CACHE`, or if JAX has a folder of its own (`jax_compilation_cache_dir`) or no compilation cache.
+    A folder that another user owns (except root) or can write to is not used, and `warn` gets a line once.
     """
     is_on, config = os.environ.get(VARIABLE) or "true", dict[str, Any](jax.config.values)
     one_of("true", "false").check(VARIABLE, is_on)

@@ -13,7 +13,6 @@ Programs make their settings, what `--help` says about them, and the axes of swe
 import re
 from collections.abc import Callable, Mapping
 from dataclasses import Field, dataclass, field, fields, is_dataclass, replace
-from functools import partial
 from typing import Any, TypeVar, get_args
 
 import numpy as np
@@ -51,11 +50,9 @@ class Rule:
 
 def one_of(*choices: Any) -> Rule:
     """Some words, numbers, flags or None."""
-    plain = {None: "null", True: "true", False: "false"}
-    words = ", ".join(plain[each] if each is None or isinstance(each, bool) else str(each) for each in choices)
-    return Rule(
-        lambda value: any(type(value) is type(choice) and value == choice for choice in choices), f"one of {words}"
-    )
+    words = ", ".join({"None": "null", "True": "true", "False": "false"}.get(str(each), str(each)) for each in choices)
+    typed = [(type(choice), choice) for choice in choices]  # 1 is not True
+    return Rule(lambda value: (type(value), value) in typed, f"one of {words}")
 
 
 def word_of(words: Any) -> Rule:
@@ -68,19 +65,16 @@ def text(pattern: str = r"(?s).+", expected: str = "text") -> Rule:
     return Rule(lambda value: isinstance(value, str) and bool(re.fullmatch(pattern, value)), expected)
 
 
-def number(low: float, high: float) -> Rule:
+def number(low: float, high: float, kind: Any = int | float | np.number) -> Rule:
     """A number in a range, its ends included."""
-    return Rule(partial(_holds, int | float | np.number, low, high), f"a number from {low:g} to {high:g}", (low, high))
+    holds = lambda value: isinstance(value, kind) and not isinstance(value, bool) and bool(low <= value <= high)  # noqa: E731
+    return Rule(holds, f"a number from {low:g} to {high:g}", (low, high))
 
 
 def whole(low: int, high: int) -> Rule:
     """An integer in a range, its ends included."""
-    holds = partial(_holds, int | np.integer, low, high)
-    return Rule(holds, f"a whole number from {low} to {high}", (low, high), is_whole=True)
-
-
-def _holds(kind: Any, low: float, high: float, value: Any) -> bool:
-    return isinstance(value, kind) and not isinstance(value, bool) and bool(low <= value <= high)
+    rule = number(low, high, int | np.integer)
+    return replace(rule, expected=f"a whole number from {low} to {high}", is_whole=True)
 
 
 def list_of(rule: Rule, length: int = 0) -> Rule:
@@ -95,8 +89,7 @@ def list_of(rule: Rule, length: int = 0) -> Rule:
 
 def or_list(rule: Rule) -> Rule:
     """A value that a rule allows, or a list of such values."""
-    several = list_of(rule)
-    return Rule(lambda value: rule.holds(value) or several.holds(value), f"{rule.expected}, or a list of them")
+    return rule | replace(list_of(rule), expected="a list of them")
 
 
 FLAG = one_of(True, False)
@@ -138,10 +131,9 @@ class Setting:
 
 
 def setting(default: Any, rule: Rule, note: str = "", *, static: bool = False, recipe: bool = True, **more: Any) -> Any:
-    """Declare a field as a setting; a function is called for the default.
+    """Declare a field as a setting, with more attributes of `Setting`; a function is called for the default.
 
-    `static` fields of a scorer are no leaves. Fields without `recipe` change no result. `more` are attributes of
-    `Setting`.
+    `static` fields of a scorer are no leaves. Fields without `recipe` change no result.
     """
     plain = None if default == more.get("none") else [*default] if isinstance(default, tuple) else default
     metadata = {_KEY: Setting(plain, rule, note, **more), "static": static, "recipe": recipe}

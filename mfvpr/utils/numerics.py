@@ -197,8 +197,7 @@ def available_cpus() -> int:
 
 def device_bytes(tree: Any) -> int | None:
     """Memory of the device of the first array; None for a processor, which has no memory of its own."""
-    stats = device_of(tree).memory_stats()
-    return stats["bytes_limit"] if stats else None
+    return (device_of(tree).memory_stats() or {}).get("bytes_limit")
 
 
 def free_bytes(device: Device) -> int:

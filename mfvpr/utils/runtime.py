@@ -49,16 +49,11 @@ class Runtime:
             raise InputError(f"memory={self.memory!r}: expected GB above 0, or None")
 
     def map(
-        self,
-        function: Callable[..., Iterator[Result]],
-        shared: tuple[Any, ...],
-        rows: Sequence[int],
-        label: str,
-        multiple: int,
+        self, function: Callable[..., Iterator[Result]], shared: tuple, rows: Sequence[int], label: str, multiple: int
     ) -> Iterator[Result]:
-        """Results of `function(*shared, rows)`, one for each row, with progress; with a cluster, block by block.
+        """Results of `function(*shared, rows)`, one for each row, with progress.
 
-        Blocks come as they finish; the rows of a block are a multiple of `multiple`, but for the last.
+        With a cluster, they come in blocks as these finish, of a multiple of `multiple` rows but for the last.
         """
         cluster = self.cluster
         results = function(*shared, rows) if cluster is None else cluster.map(function, shared, rows, multiple)
@@ -91,14 +86,13 @@ class Stopwatch:
 def ordered_map(function: Callable[[Item], Result], items: Iterable[Item], *, workers: int) -> Iterator[Result]:
     """`map` on threads, for work that releases the interpreter lock: in order, at most 2 x `workers` ahead."""
     remaining, futures = iter(items), deque[Future[Result]]()
-    with ThreadPoolExecutor(workers) as pool:
-        try:
-            while True:
-                next_items = itertools.islice(remaining, 2 * workers - len(futures))
-                futures.extend(pool.submit(function, item) for item in next_items)
-                if not futures:
-                    return
-                yield futures.popleft().result()
-        finally:
-            for future in futures:
-                future.cancel()
+    pool = ThreadPoolExecutor(workers)
+    try:
+        while True:
+            next_items = itertools.islice(remaining, 2 * workers - len(futures))
+            futures.extend(pool.submit(function, item) for item in next_items)
+            if not futures:
+                return
+            yield futures.popleft().result()
+    finally:
+        pool.shutdown(cancel_futures=True)

@@ -7,7 +7,7 @@ import pytest
 from flax import nnx
 
 from mfvpr.checkpoints import networks
-from mfvpr.checkpoints.conversion import CONV, LINEAR, Rule, Table
+from mfvpr.checkpoints.conversion import Table
 from tests.needs import skip_without
 
 
@@ -18,17 +18,7 @@ class Tiny(nnx.Module):
         self.mix = nnx.List([nnx.Linear(4, 5, rngs=rngs), nnx.Linear(5, 2, rngs=rngs)])
 
 
-TABLE = Table(
-    (
-        Rule(r"net\.conv\.weight", "conv.kernel", CONV),
-        Rule(r"net\.(conv|bn)\.bias", r"\1.bias"),
-        Rule(r"net\.bn\.weight", "bn.scale"),
-        Rule(r"net\.bn\.running_(mean|var)", r"bn.\1"),
-        Rule(r"net\.mix\.(\d)\.weight", r"mix.\1.kernel", LINEAR),
-        Rule(r"net\.mix\.(\d)\.bias", r"mix.\1.bias"),
-    ),
-    ignored=(r".*\.num_batches_tracked",),
-)
+TABLE = Table({r"net\.(conv|bn|mix\.\d)": r"\1"})
 _BN = ("bias", "mean", "scale", "var")
 SOURCE_SHAPES = {
     "net.conv.weight": (4, 3, 3, 3),

@@ -105,8 +105,6 @@ def test_lines_of_localize(convert, tmp_path, settings):
 
 @pytest.mark.parametrize(("layout", "more", "words"), [
     ("tum", [], "--poses: expected a path for --layout tum"),
-    ("kitti", ["--poses", "p", "--times", "t"], "--times: expected none for --layout kitti"),
-    ("preds", ["--query-prefix", "a/"], "--query-prefix, --database-prefix: expected none for --layout preds"),
     ("shifts", [], "0000.png: expected the time as the name of the file"),
     ("csv", [], "argument --layout: invalid choice: 'csv'"),
 ])  # fmt: skip

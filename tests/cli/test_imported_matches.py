@@ -49,11 +49,9 @@ def test_an_evaluation_of_the_matches_of_a_tool(settings, more, tmp_path, succee
     assert "imported matches" in (tmp_path / "out" / "report.html").read_text()
 
 
-@pytest.mark.parametrize("folder", ["kapture", "kapture/reconstruction/matches/sift", "link"])
+@pytest.mark.parametrize("folder", ["kapture", "kapture/reconstruction/matches/sift"])
 def test_changed_keypoints_are_read_again(settings, tools, folder, tmp_path, succeed):
     shutil.copytree(tools / "kapture", tmp_path / "kapture")
-    (tmp_path / "link").mkdir()
-    (tmp_path / "link" / "reconstruction").symlink_to(tmp_path / "kapture" / "reconstruction")
     [file] = (tmp_path / "kapture").rglob("queries/0000.png.kpt")
     scores = []
     for out, factor in (("first", 1), ("moved", 0.8)):
@@ -69,8 +67,6 @@ def test_changed_keypoints_are_read_again(settings, tools, folder, tmp_path, suc
     (["matching.matches={tools}/hloc/matches.h5"], "give hloc's feats*.h5"),
     (["matching.matches={tools}/kapture", "matching.image_size=[64,64]"], "image of 64"),
     (["matching.matches={tools}/kapture", "matching.query_prefix=other/"], "prefix"),
-    (["matching.matches={tools}/kapture", "matching.verified=true"], "verified=True"),
-    (["matching.matches={tools}/kapture", "scorer=histogram", "scorer.weight=ratio"], "with_ratio=True"),
 ])  # fmt: skip
 def test_wrong_settings_are_one_line(settings, refuse, more, words, tmp_path):
     assert words in refuse("evaluate", *settings(*more))

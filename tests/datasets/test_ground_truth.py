@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from mfvpr import InputError, datasets
-from mfvpr.datasets import AllowedTruth, FrameTruth, IndexFile, LabelFiles, LabelTruth, Positives, RadiusTruth
+from mfvpr.datasets import AllowedTruth, FrameTruth, IndexFile, LabelFiles, Positives, RadiusTruth
 from mfvpr.datasets.ground_truth import threshold_words
 from mfvpr.utils.files import write_text
 from tests import oracles
@@ -120,16 +120,6 @@ def test_a_name_in_two_folders_needs_its_path(tmp_path):
     full = "left/0.png,x\nright/0.png,y\n"
     truth = datasets.folder(both, both, ground_truth=labels(tmp_path, full, full)).truth
     np.testing.assert_array_equal(truth.positives(0).dense(), np.eye(2, dtype=bool))
-
-
-def test_many_labels_are_a_loop_over_all_pairs():
-    rng = np.random.default_rng(0)
-    truth = LabelTruth(rng.integers(-1, 60, 2000), rng.integers(-1, 60, 3000))
-    positives = truth.positives(0)
-    for query in (0, 7, 1999):
-        is_correct = (truth.database_labels == truth.query_labels[query]) & (truth.query_labels[query] >= 0)
-        np.testing.assert_array_equal(positives.of(query), np.flatnonzero(is_correct))
-        np.testing.assert_array_equal(np.isfinite(truth.distance(query)), is_correct)
 
 
 @given(st.integers(0, 2**32 - 1), st.sampled_from([0.0, 3.0, 25.0, 1e6]))

@@ -13,7 +13,7 @@ from mfvpr.datasets import read_image
 from mfvpr.evaluation.drives import STREETS
 from mfvpr.evaluation.system import noise_images
 from mfvpr.features import VladFitting
-from mfvpr.localization.map_images import read_settings
+from mfvpr.localization.map_settings import read_settings
 from mfvpr.storage import FeatureCache
 from mfvpr.storage.maps import MapFile
 from tests.builders import map_system

@@ -15,9 +15,8 @@ from mfvpr.evaluation.evidence import LEAST_MATCHES
 from mfvpr.evaluation.stages import explain
 from mfvpr.evaluation.system import noise_images
 from mfvpr.features import Aggregated, Description, Scale, Sift, VladFitting
-from mfvpr.localization import Map, Prediction
-from mfvpr.localization import map as map_module
-from mfvpr.localization.map import match_and_score
+from mfvpr.localization import Map, Prediction, query_steps
+from mfvpr.localization.query_steps import match_and_score
 from mfvpr.retrieval import Retrieval
 from mfvpr.storage import FeatureCache
 from mfvpr.storage.maps import check_entry
@@ -71,9 +70,9 @@ def test_answers_are_those_of_an_evaluation_with_a_store(dataset, folder, tmp_pa
 
 def test_answers_do_not_depend_on_the_cores(dataset, folder, monkeypatch):
     predictions = []
-    monkeypatch.setattr(map_module, "_PAIRS_AT_ONCE", 2)  # of five candidates
+    monkeypatch.setattr(query_steps, "_PAIRS_AT_ONCE", 2)  # of five candidates
     for cores in (1, 2, 3, 7):
-        monkeypatch.setattr(map_module, "available_cpus", lambda cores=cores: cores)
+        monkeypatch.setattr(query_steps, "available_cpus", lambda cores=cores: cores)
         predictions.append([opened(folder).localize(path).as_json() for path in dataset.queries.paths[:4]])
     assert predictions[1:] == predictions[:1] * 3
 

@@ -39,7 +39,7 @@ def test_every_first_answer_has_the_shift_that_the_library_says(root, tmp_path, 
         (line["query"], line["database"]) for line in reversed(first.values())
     ]
     inputs = prepare(settings, Stopwatch())
-    matches, candidates = inputs.match(Stopwatch())
+    matches, candidates = inputs.match()
     weight = evaluation.assembly.scorers(settings.scorer)["histogram"].weight
     scorer = HistogramOfShifts(bin_size=5.0, sigma=10.0, weight=weight)
     names = inputs.dataset.database.names

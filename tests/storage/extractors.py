@@ -51,11 +51,11 @@ class TwoScales:
     def __call__(self, images):
         local = [description.features for description in SIFT(images)]
         return [
-            Description(mean.vector, (features, first_features(features, step=2)))
+            Description(mean.vector, (features, every_second(features)))
             for mean, features in zip(Mean()(images), local, strict=True)
         ]
 
 
-def first_features(features, number=None, step=1):
-    """The first features of an image, or every second."""
-    return jax.tree.map(lambda values: values if values.shape == (2,) else values[:number:step], features)
+def every_second(features):
+    """Every second feature of an image."""
+    return jax.tree.map(lambda values: values if values.shape == (2,) else values[::2], features)

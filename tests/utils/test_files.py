@@ -2,7 +2,6 @@
 
 import fcntl
 import os
-import threading
 
 import pytest
 
@@ -32,19 +31,3 @@ def test_a_folder_is_held_by_one_block_and_left_empty(tmp_path):
         os.close(handle)
     with lock_folder(tmp_path, KeyError("in use")):
         assert list(tmp_path.iterdir()) == []
-
-
-def test_without_an_error_it_waits(tmp_path):
-    order = []
-
-    def wait_for_it():
-        with lock_folder(tmp_path, None):
-            order.append("second")
-
-    other = threading.Thread(target=wait_for_it)
-    with lock_folder(tmp_path, None):
-        other.start()
-        other.join(timeout=0.2)
-        order.append("first")
-    other.join(timeout=30)
-    assert order == ["first", "second"]

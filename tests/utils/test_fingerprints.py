@@ -91,17 +91,6 @@ def test_classes_of_the_library_are_known_by_name_and_fields():
     }
 
 
-def test_a_recipe_of_ones_own_belongs_to_its_class():
-    class Theirs:
-        recipe = "thumbnails"
-
-    class Others(Theirs):
-        pass
-
-    assert recipe_of(Theirs())["recipe"] == "thumbnails"
-    assert recipe_of(Theirs()) != recipe_of(Others())
-
-
 def test_a_network_is_known_by_its_weights():
     plan = blueprint(entry_of("aliked-t16"))
 

@@ -157,8 +157,7 @@ def plan_drives(seed: int, count: int, image_size: tuple[int, int]) -> tuple[lis
     """
     rng = np.random.default_rng([seed, 6])
     queries = _weave(rng, count, image_size)
-    wobble = 0.3 * _DEGREE * rng.standard_normal((2, count))
-    poses = zip(queries, *wobble, strict=True)
+    poses = zip(queries, *(0.3 * _DEGREE * rng.standard_normal((2, count))), strict=True)
     return [Camera(LANE, query.z, heading, pitch, image_size) for query, heading, pitch in poses], queries
 
 

@@ -1,0 +1,149 @@
+"""What a map keeps beside its images: settings of its system, and the confidence that a drive gives."""
+
+import json
+import warnings
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from mfvpr.datasets.datasets import Dataset, ImageFolder
+from mfvpr.datasets.ground_truth import middle
+from mfvpr.evaluation.confidence import REFUSALS, CalibrationData, Confidence, absent_ranking, calibration_data
+from mfvpr.evaluation.dataset_ranking import rank_dataset
+from mfvpr.evaluation.evidence import evidence_against
+from mfvpr.evaluation.system import Note, System
+from mfvpr.features.extractor import Extractor
+from mfvpr.features.vlad import VladFitting
+from mfvpr.matchers.host_matcher import PairSource
+from mfvpr.retrieval.search import ExactSearch
+from mfvpr.storage.feature_cache import FeatureCache
+from mfvpr.storage.maps import MapFile
+from mfvpr.systems import assembly
+from mfvpr.systems.assembly import SystemSettings
+from mfvpr.utils.errors import InputError
+from mfvpr.utils.fields import from_values
+from mfvpr.utils.fingerprints import fingerprint, recipe_of
+
+_KEPT = ("features", "retrieval", "matching", "scorer", "candidates", "fusion", "final", "ties")  # settings
+_ABOUT = 1.5  # relative difference of numbers of pixels: sides are rounded
+_USUAL = 10  # images with the shares of `REFUSALS`, that are added to those of a drive
+_LEAST_RANGE = 0.02  # of the confidence over a drive that tells correct from incorrect predictions
+
+
+def describers_of(system: System) -> tuple[Extractor, Extractor | VladFitting]:
+    """The extractors of features and of global descriptors; an InputError for a system that a map cannot use."""
+    pipeline, retriever = system.pipeline, system.pipeline.retriever
+    extractor: Any = pipeline.extractor
+    describer: Any = getattr(retriever, "describer", None)
+    is_own = isinstance(describer, Extractor)
+    if isinstance(getattr(describer, "fitting", None), VladFitting):
+        is_own = describer.extractor is extractor or recipe_of(describer.extractor) == recipe_of(extractor)
+    needs = {
+        "an extractor of local features of one scale": isinstance(extractor, Extractor) and len(extractor.scales) == 1,
+        "a matcher that JAX can compile": not isinstance(pipeline.matcher, PairSource),
+        "a number of candidates": pipeline.candidates != "all",
+        "single images; mfvpr.Route follows a drive": not (system.correlated or system.sequences),
+        "retrieval by global descriptors without whitening": isinstance(
+            getattr(retriever, "search", None), ExactSearch
+        ),
+        "descriptors of an extractor, or Aggregated(extractor, VladFitting()) of its own": is_own,
+    }
+    for need, is_met in needs.items():
+        if not is_met:
+            raise InputError(f"a map needs {need}")
+    return extractor, getattr(describer, "fitting", describer)
+
+
+def parts_of(system: System) -> dict[str, Any]:
+    """What a map keeps of a system: `system`, its settings if it has some, and `recipe`; an InputError without one."""
+    extractor, describer = describers_of(system)
+    try:
+        parts = {"recipe": {"extractor": recipe_of(extractor), "describer": recipe_of(describer)}}
+    except TypeError as error:
+        fix = "by which a map knows what made its features; see mfvpr.utils.recipe_of"
+        raise InputError(f"{error}, {fix}") from None
+    if system.settings is not None:
+        parts = {"system": {name: system.settings[name] for name in _KEPT}} | parts
+    return json.loads(json.dumps(parts))  # tuples become lists
+
+
+def read_settings(folder: Path) -> dict[str, Any]:
+    """The settings of the map in a folder; an InputError without one, or for a system that no settings describe."""
+    if content := MapFile(folder).part("system"):
+        return json.loads(content)
+    fix = "Make one with `mfvpr map build` or `Map.create`"
+    open_map = "open a map of a system of your own with `Map(folder, system)`"
+    raise InputError(f"{folder}: expected a folder with a map, got none. {fix}, or {open_map}.")
+
+
+def read_system(folder: Path) -> System:
+    """The system that a map was made with; raises as `read_settings`, or if weights are missing."""
+    settings = read_settings(folder)
+    try:
+        return assembly.system(from_values(SystemSettings, settings))
+    except InputError as error:
+        raise InputError(f"{folder}: {error}") from None
+
+
+def fit_to_map(folder: Path, system: System, images: ImageFolder | None, note: Note) -> System:
+    """The system at the image size of the map in a folder; in a new one, at that of the images, see `System`.
+
+    Raises `InputError` if a new map has no images to take the shape from, or one of images of another size.
+    """
+    if system.pipeline.pixels is None:
+        return system
+    if system.settings is not None and (content := MapFile(folder).part("system")):
+        width, height = json.loads(content)["features"]["image_size"]
+        if not 1 / _ABOUT < width * height / system.pipeline.pixels < _ABOUT:
+            got = f"{system.pipeline.pixels} pixels. Use features.image_size=[{width},{height}]"
+            raise InputError(f"{folder}: this map was made with images of {width} x {height} px, got {got}.")
+        return system.with_image_size((width, height))
+    if images is None:
+        fix = "Use `Map.create`, or a system with features.image_size=[WIDTH,HEIGHT]"
+        raise InputError(f"image_size: expected the images of a new map, whose shape decides, got none. {fix}.")
+    return system.fit_image_size([images], note)
+
+
+def fit_on_drive(dataset: Dataset, system: System, cache: FeatureCache | None) -> tuple[Confidence, CalibrationData]:
+    """Fit the confidence of the ranking that decides on a data set; also what it was fitted on.
+
+    Each query counts twice: as it is, and without the images of its place, see `calibration_data`.
+    """
+    truth, root, cache = dataset.only.truth, dataset.queries.root, cache or FeatureCache()
+    if truth is None:
+        raise InputError(f"{dataset.name}: expected a ground truth, which says what is correct, got none")
+    result, threshold = rank_dataset(dataset, system, cache=cache), middle(truth.thresholds())
+    [ranked] = result.systems[system.headline]
+    absent = absent_ranking(ranked, truth, threshold)
+    refused = []  # of the queries as they are, and without the images of their place
+    for rankings in (ranked, absent):
+        [reasons] = evidence_against(replace(result, systems={system.headline: [rankings]}), cache)
+        refused.append(np.array([reason is not None for reason in reasons]))
+    shown, has_absent = truth.positives(threshold).counts > 0, absent.rows[:, 0] >= 0
+    on, off = refused[0][shown], np.concatenate([refused[0][~shown], refused[1][has_absent]])
+    usual_on, usual_off = _USUAL * np.array(REFUSALS)
+    refusals = (on.sum() + usual_on) / (len(on) + _USUAL), (off.sum() + usual_off) / (len(off) + _USUAL)
+    data = calibration_data(ranked, truth, threshold)
+    confidence = replace(data.fit(), refusals=(float(refusals[0]), float(refusals[1])))
+    probabilities, reasons = confidence.probability(data.present), list[str]()
+    if not data.num_absent:
+        reason = "without the images of a query's place there are no candidates, so that places that the map does not"
+        reasons.append(f"{reason} show get too high a confidence")
+    if np.ptp(probabilities[np.isfinite(probabilities)]) < _LEAST_RANGE:
+        reason = f"scores do not tell correct predictions ({data.correct.sum()} of {len(data.correct)}) from incorrect"
+        reasons.append(f"{reason} ones, so that every image gets the same confidence")
+    for reason in reasons:
+        warnings.warn(f"{root}: {reason}; calibrate on a longer drive", stacklevel=3)
+    return confidence, data
+
+
+def system_fingerprint(system: System) -> str | None:
+    """A hash of everything that scores depend on; None if a part has no recipe."""
+    pipeline = system.pipeline
+    parts = (pipeline.extractor, pipeline.retriever, pipeline.matcher, pipeline.candidates, dict(system.scorers))
+    try:
+        return fingerprint(recipe_of([*parts, dict(system.fused), system.ties, system.headline]))
+    except TypeError:
+        return None
