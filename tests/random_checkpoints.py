@@ -102,23 +102,15 @@ def layered(tensors: Mapping[str, np.ndarray]) -> dict[str, dict[str, np.ndarray
 
 def random_checkpoint(shapes: Shapes, seed: int = 0) -> dict[str, np.ndarray]:
     """Plausible weights: each depends on its name, its shape and the seed alone."""
-    return {name: _as_published(name, _random(name, shape, seed)) for name, shape in shapes.items()}
-
-
-def _as_published(name: str, tensor: np.ndarray) -> np.ndarray:
-    """The tensor; NetVLAD assigns more decidedly, positions and registers count as much as patches do."""
-    if name.endswith("aggregation.1.p"):
-        return np.float32([2.875])
-    if name.endswith(("pos_embed", "register_tokens")):
-        return tensor / tensor.std() / 2
-    return 40 * tensor if name == "pool.conv.weight" else tensor
+    return {name: _random(name, shape, seed) for name, shape in shapes.items()}
 
 
 def _random(name: str, shape: tuple[int, ...], seed: int) -> np.ndarray:
     if name.endswith("num_batches_tracked"):
         return np.full(shape, 1000, np.int64)
-    rng = np.random.default_rng([seed, zlib.crc32(name.encode())])
-    normal = rng.standard_normal(shape)
+    if name.endswith("aggregation.1.p"):
+        return np.float32([2.875])
+    normal = np.random.default_rng([seed, zlib.crc32(name.encode())]).standard_normal(shape)
     if name.endswith("running_var"):
         values = 1 + 0.5 * np.tanh(normal)
     elif name.endswith(("bias", "running_mean")):
@@ -127,7 +119,10 @@ def _random(name: str, shape: tuple[int, ...], seed: int) -> np.ndarray:
         values = 1 + 0.1 * normal
     else:  # He et al.: keeps the variance through a ReLU
         values = math.sqrt(2 / math.prod(shape[1:])) * normal
-    return values.astype(np.float32)
+    tensor = values.astype(np.float32)
+    if name.endswith(("pos_embed", "register_tokens")):  # they count as much as patches do
+        return tensor / tensor.std() / 2
+    return 40 * tensor if name == "pool.conv.weight" else tensor  # NetVLAD assigns more decidedly
 
 
 def for_networks() -> Iterator[tuple[str, dict[str, np.ndarray]]]:
@@ -143,11 +138,15 @@ def for_networks() -> Iterator[tuple[str, dict[str, np.ndarray]]]:
 
 def with_biases(weights: Shapes) -> Shapes:
     """Shapes of layers' weights, each followed by that of the bias."""
-    return {
-        f"{name}.{part}": shape
-        for name, weight in weights.items()
-        for part, shape in (("weight", weight), ("bias", weight[:1]))
-    }
+    parts = {name: {"weight": weight, "bias": weight[:1]} for name, weight in weights.items()}
+    return {f"{name}.{part}": shape for name, both in parts.items() for part, shape in both.items()}
+
+
+def _norms(widths: dict[str, int]) -> Shapes:
+    """Shapes of batch normalizations."""
+    names = ("weight", "bias", "running_mean", "running_var")
+    shapes = {f"{layer}.{name}": (width,) for layer, width in widths.items() for name in names}
+    return shapes | {f"{layer}.num_batches_tracked": () for layer in widths}
 
 
 _POSITIONS = (0, 2, 5, 7, 10, 12, 14, 17, 19, 21, 24, 26, 28)  # of VGG16's convolutions in torch's networks
@@ -184,58 +183,36 @@ def netvlad_shapes(clusters: int = 16, outputs: int | None = 4096) -> Shapes:
 
 def gem_shapes(backbone: str = "resnet50", outputs: int = 2048) -> Shapes:
     """The tensors of CosPlace's checkpoints."""
-    channels = {"vgg16": 512, "resnet50": 2048}[backbone]
-    shapes = (
-        _vgg16("backbone")
-        if backbone == "vgg16"
-        else {
-            "backbone.0.weight": (64, 3, 7, 7),
-            **_norm("backbone.1", 64),
-            **_bottlenecks([f"backbone.{place}" for place in (4, 5, 6, 7)]),
-        }
-    )
+    if backbone == "vgg16":
+        shapes, channels = _vgg16("backbone"), 512
+    else:
+        shapes, channels = _resnet50("backbone.0", "backbone.1", [f"backbone.{place}" for place in (4, 5, 6, 7)]), 2048
     return shapes | {"aggregation.1.p": (1,)} | with_biases({"aggregation.3": (outputs, channels)})
 
 
 def dinov2_shapes(width: int, depth: int, registers: int = 0, prefix: str = "", *, adapted: bool = False) -> Shapes:
     """The tensors of DINOv2's checkpoints; `adapted` those of SelaVPR's backbone."""
-    shapes = {
-        "cls_token": (1, 1, width),
-        "pos_embed": (1, 1370, width),
-        "mask_token": (1, width),
-        "patch_embed.proj.weight": (width, 3, 14, 14),
-        "patch_embed.proj.bias": (width,),
-        "norm.weight": (width,),
-        "norm.bias": (width,),
-    }
+    shapes = {"cls_token": (1, 1, width), "pos_embed": (1, 1370, width), "mask_token": (1, width)}
     if registers:
         shapes["register_tokens"] = (1, registers, width)
-    linear = {"attn.qkv": (3, 1), "attn.proj": (1, 1), "mlp.fc1": (4, 1), "mlp.fc2": (1, 4)}
-    if adapted:
-        adapters = (f"adapter{number}.D_fc{place}" for number in (1, 2) for place in (1, 2))
-        linear |= {name: (0.5, 1) if name.endswith("1") else (1, 0.5) for name in adapters}
-    for block in (f"blocks.{place}" for place in range(depth)):
-        shapes |= with_biases(
-            {
-                f"{block}.{name}": (int(outputs * width), int(inputs * width))
-                for name, (outputs, inputs) in linear.items()
-            }
-        )
-        for number in (1, 2):
-            shapes[f"{block}.ls{number}.gamma"] = (width,)
-            shapes |= {f"{block}.norm{number}.{part}": (width,) for part in ("weight", "bias")}
-    return {f"{prefix}{name}": shape for name, shape in shapes.items()}
+    weights = {"patch_embed.proj": (width, 3, 14, 14), "norm": (width,)}
+    of_block = {"attn.qkv": (3 * width, width), "attn.proj": (width, width), "norm1": (width,), "norm2": (width,)}
+    of_block |= {"mlp.fc1": (4 * width, width), "mlp.fc2": (width, 4 * width)}
+    for number in (1, 2) if adapted else ():
+        adapter = f"adapter{number}.D_fc"
+        of_block |= {f"{adapter}1": (width // 2, width), f"{adapter}2": (width, width // 2)}
+    for place in range(depth):
+        weights |= {f"blocks.{place}.{name}": shape for name, shape in of_block.items()}
+        shapes |= {f"blocks.{place}.ls{number}.gamma": (width,) for number in (1, 2)}
+    return {f"{prefix}{name}": shape for name, shape in (shapes | with_biases(weights)).items()}
 
 
 def selavpr_shapes(width: int = 1024, depth: int = 24, registers: int = 0, prefix: str = "module.") -> Shapes:
     """The tensors of SelaVPR's checkpoints, which hold them below `model_state_dict`."""
-    head = {
-        "aggregation.1.p": (1,),
-        "LocalAdapt.upconv1.weight": (width, 256, 3, 3),
-        "LocalAdapt.upconv1.bias": (256,),
-        "LocalAdapt.upconv2.weight": (256, 128, 3, 3),
-        "LocalAdapt.upconv2.bias": (128,),
-    }
+    head: Shapes = {"aggregation.1.p": (1,)}
+    for number, inputs, outputs in ((1, width, 256), (2, 256, 128)):  # transposed convolutions
+        layer = f"LocalAdapt.upconv{number}"
+        head |= {f"{layer}.weight": (inputs, outputs, 3, 3), f"{layer}.bias": (outputs,)}
     backbone = dinov2_shapes(width, depth, registers, f"{prefix}backbone.", adapted=True)
     return backbone | {f"{prefix}{name}": shape for name, shape in head.items()}
 
@@ -286,72 +263,65 @@ def write_matlab(path: Path, content: dict[str, Any], *, packed: bool = True) ->
 
 def mixvpr_shapes(out_channels: int = 1024, out_rows: int = 4) -> Shapes:
     """The tensors of MixVPR's checkpoints: ResNet-50 to its third layer, the mixer, two projections."""
-    shapes = {"backbone.model.conv1.weight": (64, 3, 7, 7), **_norm("backbone.model.bn1", 64)}
-    shapes |= _bottlenecks([f"backbone.model.layer{layer}" for layer in (1, 2, 3)])
-    weights = {}
+    backbone = "backbone.model"
+    shapes = _resnet50(f"{backbone}.conv1", f"{backbone}.bn1", [f"{backbone}.layer{layer}" for layer in (1, 2, 3)])
+    weights = {"aggregator.channel_proj": (out_channels, 1024), "aggregator.row_proj": (out_rows, 400)}
     for mixer in (f"aggregator.mix.{place}.mix" for place in range(4)):
         weights |= {f"{mixer}.0": (400,), f"{mixer}.1": (400, 400), f"{mixer}.3": (400, 400)}
-    weights |= {"aggregator.channel_proj": (out_channels, 1024), "aggregator.row_proj": (out_rows, 400)}
     return shapes | with_biases(weights)
 
 
-def _bottlenecks(layers: list[str]) -> Shapes:
-    """The tensors of ResNet-50's first layers, which have these names."""
-    shapes, inputs = {}, 64
+def _resnet50(conv1: str, bn1: str, layers: list[str]) -> Shapes:
+    """The tensors of ResNet-50 with these names; fewer than four layers are the first."""
+    weights: Shapes = {conv1: (64, 3, 7, 7)}
+    norms, inputs = {bn1: 64}, 64
     for layer, blocks, width in zip(layers, (3, 4, 6, 3), (64, 128, 256, 512), strict=False):
-        for block in range(blocks):
-            prefix = f"{layer}.{block}"
+        for prefix in (f"{layer}.{block}" for block in range(blocks)):
             sizes = ((width, inputs, 1, 1), (width, width, 3, 3), (4 * width, width, 1, 1))
             for index, size in enumerate(sizes, start=1):
-                shapes[f"{prefix}.conv{index}.weight"] = size
-                shapes |= _norm(f"{prefix}.bn{index}", size[0])
-            if block == 0:
-                shapes[f"{prefix}.downsample.0.weight"] = (4 * width, inputs, 1, 1)
-                shapes |= _norm(f"{prefix}.downsample.1", 4 * width)
+                weights[f"{prefix}.conv{index}"], norms[f"{prefix}.bn{index}"] = size, size[0]
+            if prefix == f"{layer}.0":
+                weights[f"{prefix}.downsample.0"] = (4 * width, inputs, 1, 1)
+                norms[f"{prefix}.downsample.1"] = 4 * width
             inputs = 4 * width
-    return shapes
+    return {f"{name}.weight": shape for name, shape in weights.items()} | _norms(norms)
 
 
 def lightglue_shapes(inputs: int = 128, width: int = 256, layers: int = 9, heads: int = 4) -> Shapes:
     """The tensors of LightGlue's checkpoints for features without orientations, such as aliked_lightglue.pth."""
-    linear = {"input_proj": (width, inputs)}
-    shapes = {"posenc.Wr.weight": (width // heads // 2, 2)}
+    square, wide = (width, width), 2 * width
+    update = {"ffn.0": (wide, wide), "ffn.1": (wide,), "ffn.3": (width, wide)}
+    kinds = {
+        "self_attn": {"Wqkv": (3 * width, width), "out_proj": square, **update},
+        "cross_attn": {"to_qk": square, "to_v": square, "to_out": square, **update},
+    }
+    weights = {"input_proj": (width, inputs)}
     for layer in range(layers):
-        within, across = (f"transformers.{layer}.{kind}_attn" for kind in ("self", "cross"))
-        linear |= {f"{within}.Wqkv": (3 * width, width), f"{within}.out_proj": (width, width)}
-        linear |= {f"{across}.{name}": (width, width) for name in ("to_qk", "to_v", "to_out")}
-        for block in (within, across):
-            linear |= {f"{block}.ffn.0": (2 * width, 2 * width), f"{block}.ffn.3": (width, 2 * width)}
-            shapes |= {f"{block}.ffn.1.{name}": (2 * width,) for name in ("weight", "bias")}
-        linear |= {
-            f"log_assignment.{layer}.{name}": (size, width)
-            for name, size in (("final_proj", width), ("matchability", 1))
-        }
-    linear |= {f"token_confidence.{layer}.token.0": (1, width) for layer in range(layers - 1)}
-    return shapes | with_biases(linear)
+        for kind, parts in kinds.items():
+            weights |= {f"transformers.{layer}.{kind}.{name}": shape for name, shape in parts.items()}
+        assignment = f"log_assignment.{layer}"
+        weights |= {f"{assignment}.final_proj": square, f"{assignment}.matchability": (1, width)}
+    weights |= {f"token_confidence.{layer}.token.0": (1, width) for layer in range(layers - 1)}
+    return {"posenc.Wr.weight": (width // heads // 2, 2)} | with_biases(weights)
 
 
 def aliked_shapes(widths: tuple[int, ...] = (8, 16, 32, 64), dimension: int = 64, positions: int = 16) -> Shapes:
     """The tensors of ALIKED's checkpoints, by default of aliked-t16."""
-    shapes, biased = {}, {}
+    head, moves = "desc_head", 2 * positions
+    plain = {f"{head}.sf_conv": (dimension, dimension, 1, 1)}
+    biased = {f"{head}.offset_conv.0": (moves, dimension, 3, 3), f"{head}.offset_conv.2": (moves, moves, 1, 1)}
+    norms = {}
     for block, (inputs, outputs) in enumerate(pairwise((3, *widths)), start=1):
         for place, channels in ((1, inputs), (2, outputs)):
             conv = f"block{block}.conv{place}"
             if block > 2:
                 biased[f"{conv}.offset_conv"] = (18, channels, 3, 3)
                 conv += ".regular_conv"
-            shapes |= {f"{conv}.weight": (outputs, channels, 3, 3)} | _norm(f"block{block}.bn{place}", outputs)
+            plain[conv], norms[f"block{block}.bn{place}"] = (outputs, channels, 3, 3), outputs
         if block > 1:
             biased[f"block{block}.downsample"] = (outputs, inputs, 1, 1)
-        shapes[f"conv{block}.weight"] = (dimension // 4, outputs, 1, 1)
+        plain[f"conv{block}"] = (dimension // 4, outputs, 1, 1)
     for place, size in {0: (8, dimension, 1, 1), 2: (4, 8, 3, 3), 4: (4, 4, 3, 3), 6: (1, 4, 3, 3)}.items():
-        shapes[f"score_head.{place}.weight"] = size
-    head, moves = "desc_head", 2 * positions
-    biased |= {f"{head}.offset_conv.0": (moves, dimension, 3, 3), f"{head}.offset_conv.2": (moves, moves, 1, 1)}
-    shapes[f"{head}.sf_conv.weight"] = (dimension, dimension, 1, 1)
-    return shapes | {f"{head}.agg_weights": (positions, dimension, dimension)} | with_biases(biased)
-
-
-def _norm(prefix: str, width: int) -> Shapes:
-    names = ("weight", "bias", "running_mean", "running_var")
-    return {f"{prefix}.{name}": (width,) for name in names} | {f"{prefix}.num_batches_tracked": ()}
+        plain[f"score_head.{place}"] = size
+    shapes = {f"{name}.weight": shape for name, shape in plain.items()} | with_biases(biased) | _norms(norms)
+    return shapes | {f"{head}.agg_weights": (positions, dimension, dimension)}

@@ -6,7 +6,7 @@ import math
 import jax
 import numpy as np
 
-from mfvpr.baselines import planes
+from mfvpr.baselines import homography
 
 
 def estimate(points1, points0, *, threshold, max_iterations=2000, confidence=0.995, seed=0):
@@ -15,8 +15,8 @@ def estimate(points1, points0, *, threshold, max_iterations=2000, confidence=0.9
     count = len(points1)
     best, samples, limit = (np.zeros(count, bool), np.full(count, np.inf)), 0, max_iterations
     for round_number in itertools.count():
-        drawn = np.asarray(planes.draw_four(jax.random.key(seed), round_number, np.int32(count)))
-        accepted = [four for four in drawn.T if keeps_orientation(points1[four], points0[four])][: planes.ROUND]
+        drawn = np.asarray(homography.draw_four(jax.random.key(seed), round_number, np.int32(count)))
+        accepted = [four for four in drawn.T if keeps_orientation(points1[four], points0[four])][: homography.ROUND]
         for four in accepted:
             if samples >= limit:
                 return best[0], samples, best[1]

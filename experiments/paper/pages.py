@@ -6,9 +6,8 @@ from urllib.parse import quote
 
 from experiments.paper.tables import Evaluations, average, printed_tables
 from mfvpr.report import Table
-from mfvpr.report.pages import write_comparison
-from mfvpr.report.plots import panels, save_figure
-from mfvpr.report.rendering import PAGE, Section, embed, values_table, write_page
+from mfvpr.report.figures import panels, save_figure
+from mfvpr.report.pages import PAGE, embed, write_comparison, write_page
 from mfvpr.utils.fingerprints import versions
 
 _COSTS, _ABOUT = ("sizes", "seconds"), ("data_sets", "settings")  # names of tables
@@ -67,17 +66,16 @@ def write_pages(
     costs, about = (dict(tables[name] for name in names if name in tables) for names in (_COSTS, _ABOUT))
     if left_out:
         about["Left out"] = Table(["what", "why"], [line.split(": ", 1) for line in left_out], text_columns=2)
-    about["Versions"] = values_table(versions())
     figure = out / "figures" / "averages.png"
-    averages = {"Mean recall at 1 within 2 frames": embed(figure)} if figure.exists() else {}
+    averages = {"Mean recall at 1 within 2 frames": embed(figure.read_bytes())} if figure.exists() else {}
     words = "In %. Where the paper prints a number, that and the difference stand beside ours."
     links_words = "Their own pages, and all of a data set side by side, with tests and intervals."
-    sections = [
-        Section("recall", "Recall", words, tables=recalls, images=averages),
-        Section("pages", "Every evaluation", links_words, links=addresses),
-        Section("costs", "Seconds and sizes", tables=costs),
-        Section("settings", "Data sets and settings", tables=about),
-    ]
+    parts = {
+        "Recall": {"words": words, "tables": recalls, "images": averages},
+        "Every evaluation": {"words": links_words, "links": addresses},
+        "Seconds and sizes": {"tables": costs},
+        "Data sets and settings": {"tables": about | {"Versions": versions()}},
+    }
     words = f"{len(evaluations.datasets)} data sets, {len(evaluations.folders)} evaluations, "
     words += "after Pivonka and Preucil, IEEE T-IV 2024"
-    write_page(out / PAGE, title="The paper's evaluation", words=words, facts={}, sections=sections)
+    write_page(out / PAGE, title="The paper's evaluation", words=words, facts={}, parts=parts)

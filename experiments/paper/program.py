@@ -18,8 +18,7 @@ from mfvpr.datasets import Dataset
 from mfvpr.datasets.published import published_differences
 from mfvpr.evaluation.rankings import RETRIEVAL
 from mfvpr.report import write_json, write_table
-from mfvpr.report.pages import write_report
-from mfvpr.report.rendering import PAGE
+from mfvpr.report.pages import PAGE, write_report
 from mfvpr.report.runs import LAST
 from mfvpr.utils.errors import InputError
 from mfvpr.utils.files import expand_user

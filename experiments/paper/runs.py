@@ -18,9 +18,8 @@ from mfvpr.cli.jobs import Inputs
 from mfvpr.cli.schema import Evaluate, Paper
 from mfvpr.datasets import Dataset
 from mfvpr.evaluation import Pipeline, System, rank_dataset
-from mfvpr.features import PatchNetVladFeatures, SelaVprFeatures
-from mfvpr.features.whitening import WindowExtractor
-from mfvpr.report.rendering import PAGE
+from mfvpr.features import PatchNetVladFeatures, SelaVprFeatures, SsmCells
+from mfvpr.report.pages import PAGE
 from mfvpr.report.run_files import ground_truth, write_run_folder
 from mfvpr.report.runs import LAST, write_about, write_json, writing
 from mfvpr.retrieval import fit_to_database
@@ -35,7 +34,7 @@ from mfvpr.utils.numerics import available_cpus
 INPUTS, SIZES = "made_of.json", "sizes.json"  # see `input_fingerprints` and `bytes_of_an_image`
 _SHARED = ("cache", "memory", "devices")  # settings of both programs
 _FLOAT, _KEYPOINT = 4, 12  # bytes of a number, and of a keypoint with its score
-_GRIDS = (WindowExtractor, PatchNetVladFeatures, SelaVprFeatures)
+_GRIDS = (SsmCells, PatchNetVladFeatures, SelaVprFeatures)
 QUERIES, DATABASE = 10, 60  # images; as many of the database as there are candidates, at least
 STEPS = ("retrieval", "features", "matching", "scores")
 _OUTPUTS = {"runs", "tables", "figures", "comparisons", "seconds", PAGE}

@@ -1,6 +1,6 @@
 """Scores of other systems, learned weights, and all scores and weights by name.
 
-Read first: homography (with planes), then spatial_scores and grid_anchors; `scorers` has names for all scores.
+Read first: homography, then spatial_scores and grid_anchors; `scorers` has names for all scores.
 """
 
 import lazy_loader

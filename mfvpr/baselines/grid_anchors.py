@@ -7,7 +7,7 @@ a patch of n x n cells around it. A cell of the patch agrees if index[anchor + o
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Float, Int
+from jaxtyping import Float
 
 from mfvpr.core.types import Array, Matches, value
 from mfvpr.core.weights import match_confidence
@@ -69,39 +69,19 @@ class GridAnchors:
         index = jnp.full(len(cells), len(cells), jnp.int32).at[target].min(cell0, mode="drop")
         matched = index < len(cells)
         side, half = self.side, self.size // 2
-        row, column = jnp.divmod(cells, side)
-        down, right = jnp.divmod(_OUTSIDE[self.outside] - index + half, side)  # the only offset to it, as n <= side
-        right = right - half
-        outside = (row + down < 0) | (row + down >= side) | (column + right < 0) | (column + right >= side)
-        is_near = (jnp.abs(down) <= half) & (right <= half)
-        score = self._agreements(index, matched, cells) + jnp.sum(matched & is_near & outside, dtype=jnp.int32)
+        anchors, neighbors = (masked(index, matched, never).reshape(side, side) for never in (2**20, -(2**20)))
+        neighbors = jnp.pad(neighbors, half, constant_values=_OUTSIDE[self.outside])
+
+        def count_row(row: Array, counts: Array) -> Array:  # of each patch
+            cells = jax.lax.dynamic_slice_in_dim(neighbors, row, side)
+            for column in range(self.size):
+                expected = anchors + (row - half) * side + column - half
+                counts = counts + (cells[:, column : column + side] == expected).astype(jnp.int32)
+            return counts
+
+        counts = jax.lax.fori_loop(0, self.size, count_row, jnp.zeros((side, side), jnp.int32))
+        score = jnp.sum(counts)
         usable = jnp.all((cell1 >= 0) & (cell1 < len(cells)) & (cell0 >= 0) & (cell0 < len(cells)))
         for count in (matches.count0, matches.count1):
             usable &= count is None or jnp.asarray(count) == len(cells)
         return jnp.where(usable | ~jnp.any(real), score.astype(jnp.float32), jnp.nan)
-
-    def _agreements(self, index: Array, matched: Array, cells: Int[Array, " cells"]) -> Int[Array, ""]:
-        """Number of pairs that agree, of an anchor and a cell of its patch inside the grid.
-
-        Agreement is symmetric: the offsets to the right and in the rows below suffice, shifts of the padded flat array.
-        """
-        side, half = self.side, self.size // 2
-        shift, pitch, never = index - cells, side + half, 8 * side**2  # no displacement is as large
-        anchors, neighbors = (
-            jnp.pad(masked(shift, matched, fill).reshape(side, side), ((0, 0), (0, half)), constant_values=fill)
-            for fill in (never, -never)
-        )
-        anchors, width = anchors.reshape(-1), side * pitch
-        neighbors = jnp.pad(neighbors.reshape(-1), (half, half * pitch + half), constant_values=-never)
-
-        def count_offsets(row: Array | int, columns: range) -> Array:
-            """`[width]` int32: number of offsets (row, column) that agree with each anchor."""
-            below = jax.lax.dynamic_slice_in_dim(neighbors, row * pitch, width + 2 * half)
-            return sum(
-                ((anchors == below[half + column : half + column + width]).astype(jnp.int32) for column in columns),
-                start=jnp.zeros(width, jnp.int32),
-            )
-
-        right, full_row = count_offsets(0, range(1, half + 1)), range(-half, half + 1)
-        counts = jax.lax.fori_loop(1, half + 1, lambda row, counts: counts + count_offsets(row, full_row), right)
-        return 2 * jnp.sum(counts) + jnp.sum(matched, dtype=jnp.int32)

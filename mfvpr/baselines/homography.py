@@ -2,6 +2,9 @@
 
 `Homography` has the result of OpenCV's findHomography, up to the random samples: all samples of a round are solved and
 counted at once, and samples after the one where OpenCV would stop do not count. `OpenCvHomography` calls OpenCV.
+
+A model is a matrix, row by row, that maps points of the candidate (1) to points of the query (0). Matches are the
+coordinates x1, y1, x0, y0. Samples are uniform, never degenerate, and independent of batch and padding.
 """
 
 from concurrent.futures import ThreadPoolExecutor
@@ -10,9 +13,8 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float, Int, Num
 
-from mfvpr.baselines import planes
 from mfvpr.baselines.spatial_scores import query_features
 from mfvpr.core.scorer import check_bounds
 from mfvpr.core.types import Array, Matches, value
@@ -21,8 +23,15 @@ from mfvpr.utils.errors import InputError, NoGradientError
 from mfvpr.utils.fields import FLAG, POSITIVE, check_fields, number, one_of, setting, whole
 from mfvpr.utils.numerics import at_least_single, available_cpus, is_concrete, masked, where_finite
 
-_MATCHES_PER_STEP = 16  # matches that all models of a round are compared with in one step
+ROUND = 256  # maximum number of samples of a round
 _ROUNDS = 8  # the search ends after so many times the rounds that samples without degenerate draws would need
+_DRAWS = 6 * ROUND  # draws for a round: a fifth of all draws of random points keep their orientations
+_MATCHES_PER_STEP = 16  # matches that all models of a round are compared with in one step
+_TRIANGLES = (0, 1, 2), (0, 1, 3), (0, 2, 3), (1, 2, 3)
+_FLAT = 1e-6  # area of a triangle, relative to its sides, that rounding can produce
+_STEPS = 10  # of the least squares, as in OpenCV
+_MIN_CURVATURE = 1e-9  # keeps the system solvable if the inliers do not determine a parameter
+_EXACT = jax.lax.Precision.HIGHEST
 
 
 class Estimate(NamedTuple):
@@ -47,8 +56,8 @@ class Homography:
         threshold: largest error of an inlier, px of the query; 8 and 24 in the paper.
         max_iterations: maximum number of samples; an array less than 1 scores NaN. Degenerate draws do not count, but
             the search ends early if almost all draws (49 of 50) are degenerate.
-        confidence: RANSAC stops once a sample of inliers only was drawn with this probability, assuming as many inliers
-            as the best model has; an array of 1 never stops early, one not above 0 scores NaN.
+        confidence: RANSAC stops once a sample of inliers only was drawn with this probability, if inliers are as many
+            as the best model's; an array of 1 never stops early, one not above 0 scores NaN.
         refit: fit the best model to its inliers by least squares, and count again, as OpenCV 5 does. OpenCV 4, of the
             paper's time, refines the homography after the count.
         few: score of less than 4 matches, `count` (re-ranking-for-VPR) or `zero` (Patch-NetVLAD); 4 matches score 4.
@@ -73,10 +82,8 @@ class Homography:
     def estimate(self, matches: Matches) -> Estimate:
         """Homography of one pair, with its inliers and its score."""
         points = jnp.concatenate([at_least_single(matches.points1), at_least_single(matches.points0)], axis=-1)
-        points, confidence, *limits = _without_gradient(
-            "homography: the number of inliers has no gradient; take a score that has one, such as HistogramOfShifts",
-            (points, match_confidence(matches), self.threshold, self.max_iterations, self.confidence),
-        )
+        limits = self.threshold, self.max_iterations, self.confidence
+        points, confidence, *limits = _without_gradient((points, match_confidence(matches), *limits))
         threshold, max_iterations, probability = (jnp.asarray(limit, points.dtype) for limit in limits)
         probability = jnp.minimum(probability, 1.0)  # as OpenCV
         counts = confidence.astype(points.dtype)
@@ -84,20 +91,21 @@ class Homography:
         if len(real) == 0:
             return Estimate(jnp.full((3, 3), jnp.nan, points.dtype), real, jnp.sum(counts), jnp.zeros((), jnp.int32))
         require_sizes(matches.image_size0, matches.image_size1)
-        frame = planes.Frame.of(matches.image_size1, matches.image_size0, points.dtype)
+        frame = Frame.of(matches.image_size1, matches.image_size0, points.dtype)
         normalized = masked(frame.normalize(points), real, jnp.nan)  # NaN is never an inlier
         threshold = threshold / frame.scale[1]
-        order = planes.canonical_order(masked(points, real), real)
+        order = canonical_order(masked(points, real), real)
         number = jnp.sum(real, dtype=jnp.int32)
-        limits = threshold, max_iterations, probability
-        search = _Search(matches.confidence is None, normalized[order], counts[order], number, *limits)
         # The generator is named, because others draw different numbers in a batch.
-        model, samples = search(jax.random.key(self.seed, impl="threefry2x32"))
+        key = jax.random.key(self.seed, impl="threefry2x32")
+        limits = threshold, max_iterations, probability
+        each_counts_one = matches.confidence is None
+        model, samples = _search(key, normalized[order], counts[order], number, *limits, each_counts_one)
         if self.refit:
-            model = planes.least_squares(
-                model, masked(normalized, real), masked(counts, planes.is_inlier(model, normalized, threshold))
+            model = least_squares(
+                model, masked(normalized, real), masked(counts, is_inlier(model, normalized, threshold))
             )
-        inliers = jnp.where(number == 4, real, planes.is_inlier(model, normalized, threshold))
+        inliers = jnp.where(number == 4, real, is_inlier(model, normalized, threshold))
         score = jnp.sum(masked(counts, inliers))
         few = jnp.sum(counts) if self.few == "count" else jnp.zeros_like(score)
         score = jnp.where(number == 4, jnp.sum(counts), jnp.where(number < 4, few, score))
@@ -107,75 +115,68 @@ class Homography:
         return Estimate(frame.to_pixels(model), inliers, jnp.where(usable, finite, jnp.nan), samples)
 
 
-class _Search(NamedTuple):
-    """RANSAC of one pair, with matches in canonical order and in the coordinates of a frame."""
+@jax.custom_jvp
+def _without_gradient(values: Any) -> Any:
+    return values
 
-    each_counts_one: bool
-    points: Float[Array, "slots 4"]
-    counts: Float[Array, " slots"]  # confidence of the matches
-    number: Int[Array, ""]  # of real matches
-    threshold: Float[Array, ""]
-    max_iterations: Float[Array, ""]
-    probability: Float[Array, ""]
 
-    def __call__(self, key: Array) -> tuple[Float[Array, "9"], Int[Array, ""]]:
-        """The best model, NaN if there is none, and the number of samples."""
-        dtype = self.points.dtype
-        rounds = _ROUNDS * jnp.ceil(self.max_iterations / planes.ROUND).astype(jnp.int32)
+@_without_gradient.defjvp
+def _refuse_gradient(*_: Any) -> Any:
+    advice = "take a score that has one, such as HistogramOfShifts"
+    raise NoGradientError(f"homography: the number of inliers has no gradient; {advice}")
 
-        def is_searching(state: _State) -> Array:
-            return state.has_samples & (state.samples < self._count_samples(state.inliers)) & (state.round < rounds)
 
-        def search_round(state: _State) -> _State:
-            four, num_samples = planes.draw_samples(self.points, key, state.round, jnp.maximum(self.number, 4))
-            models, place = planes.through(four), jnp.arange(planes.ROUND, dtype=jnp.int32)
-            inliers, number = self._compare(models)
-            inliers = jnp.where((place < num_samples) & (number > 3), inliers, 0.0)
-            # As if samples came one after the other: samples after the one where that search stops do not count.
-            before = jnp.concatenate([jnp.zeros_like(inliers[:1]), jax.lax.cummax(inliers)[:-1]])
-            most_before = jnp.maximum(before, state.inliers)
-            counted = (place < num_samples) & (state.samples + place < self._count_samples(most_before))
-            inliers = masked(inliers, counted)
-            best = jnp.argmax(inliers)
-            return _State(
-                round=state.round + 1,
-                samples=state.samples + jnp.sum(counted, dtype=jnp.int32),
-                inliers=jnp.maximum(inliers[best], state.inliers),
-                model=jnp.where(inliers[best] > state.inliers, models[:, best], state.model),
-                has_samples=num_samples > 0,
-            )
+def _search(
+    key: Array,
+    points: Float[Array, "slots 4"],
+    counts: Float[Array, " slots"],
+    number: Int[Array, ""],
+    threshold: Float[Array, ""],
+    max_iterations: Float[Array, ""],
+    probability: Float[Array, ""],
+    each_counts_one: bool,
+) -> tuple[Float[Array, "9"], Int[Array, ""]]:
+    """RANSAC of one pair: the best model, NaN if there is none, and the number of samples.
 
-        zero, start = jnp.zeros((), dtype), jnp.zeros((), jnp.int32)
-        state = _State(start, start, zero, jnp.full(9, jnp.nan, dtype), self.number >= 4)
-        state = jax.lax.while_loop(is_searching, search_round, state)
-        return state.model, state.samples
+    The `number` real matches come first, in canonical order and in a frame; `counts` are their confidences.
+    """
+    rounds = _ROUNDS * jnp.ceil(max_iterations / ROUND).astype(jnp.int32)
+    place, every = jnp.arange(ROUND, dtype=jnp.int32), jnp.sum(counts)
 
-    def _compare(self, models: Float[Array, "9 samples"]) -> tuple[Array, Array]:
-        """Sum of the inliers' counts and number of inliers of each model, in steps that fit into the cache."""
-        padding = (0, -len(self.counts) % _MATCHES_PER_STEP)
-        points = jnp.pad(self.points, (padding, (0, 0)), constant_values=jnp.nan).reshape(-1, _MATCHES_PER_STEP, 4)
-        counts = jnp.pad(self.counts, padding).reshape(-1, _MATCHES_PER_STEP)
-
-        def compare_step(step: Array, sums: tuple[Array, Array]) -> tuple[Array, Array]:
-            inliers, number = sums
-            for point, count in zip(points[step], counts[step], strict=True):
-                inlier = planes.is_inlier(models, point, self.threshold)
-                inliers = inliers + jnp.where(inlier, count, 0.0)
-                if not self.each_counts_one:
-                    number = number + inlier.astype(number.dtype)
-            return inliers, number
-
-        zeros = jnp.zeros_like(models[0])
-        inliers, number = jax.lax.fori_loop(0, len(points), compare_step, (zeros, zeros))
-        return inliers, inliers if self.each_counts_one else number
-
-    def _count_samples(self, inliers: Array) -> Array:
+    def count_samples(inliers: Array) -> Array:
         """Samples needed to draw four inliers with `probability`, at most `max_iterations`."""
-        share = inliers / jnp.maximum(jnp.sum(self.counts), 1e-6)
+        share = inliers / jnp.maximum(every, 1e-6)
         log_outlier = jnp.log1p(-(jnp.minimum(share, 1.0) ** 4))  # log of the probability that a sample has an outlier
-        samples = jnp.round(jnp.log1p(-self.probability) / jnp.where(log_outlier < 0, log_outlier, -1.0))
-        samples = jnp.where(log_outlier < 0, jnp.minimum(samples, self.max_iterations), self.max_iterations)
+        samples = jnp.round(jnp.log1p(-probability) / jnp.where(log_outlier < 0, log_outlier, -1.0))
+        samples = jnp.where(log_outlier < 0, jnp.minimum(samples, max_iterations), max_iterations)
         return samples.astype(jnp.int32)
+
+    def is_searching(state: _State) -> Array:
+        return state.has_samples & (state.samples < count_samples(state.inliers)) & (state.round < rounds)
+
+    def search_round(state: _State) -> _State:
+        four, num_samples = draw_samples(points, key, state.round, jnp.maximum(number, 4))
+        models = through(four)
+        inliers, number_of = _count_inliers(models, points, counts, threshold, each_counts_one)
+        inliers = jnp.where((place < num_samples) & (number_of > 3), inliers, 0.0)
+        # As if samples came one after the other: samples after the one where that search stops do not count.
+        before = jnp.concatenate([jnp.zeros_like(inliers[:1]), jax.lax.cummax(inliers)[:-1]])
+        most_before = jnp.maximum(before, state.inliers)
+        counted = (place < num_samples) & (state.samples + place < count_samples(most_before))
+        inliers = masked(inliers, counted)
+        best = jnp.argmax(inliers)
+        return _State(
+            round=state.round + 1,
+            samples=state.samples + jnp.sum(counted, dtype=jnp.int32),
+            inliers=jnp.maximum(inliers[best], state.inliers),
+            model=jnp.where(inliers[best] > state.inliers, models[:, best], state.model),
+            has_samples=num_samples > 0,
+        )
+
+    zero, start = jnp.zeros((), points.dtype), jnp.zeros((), jnp.int32)
+    state = _State(start, start, zero, jnp.full(9, jnp.nan, points.dtype), number >= 4)
+    state = jax.lax.while_loop(is_searching, search_round, state)
+    return state.model, state.samples
 
 
 class _State(NamedTuple):
@@ -186,18 +187,184 @@ class _State(NamedTuple):
     has_samples: Bool[Array, ""]  # whether the last round had a sample
 
 
-def _without_gradient(why: str, values: Any) -> Any:
-    """The values; their derivative raises `NoGradientError` with the message `why`."""
+def _count_inliers(
+    models: Float[Array, "9 samples"], points: Array, counts: Array, threshold: Array, each_counts_one: bool
+) -> tuple[Array, Array]:
+    """Sum of the inliers' counts and number of inliers of each model, in steps that fit into the cache."""
+    padding = (0, -len(counts) % _MATCHES_PER_STEP)
+    points = jnp.pad(points, (padding, (0, 0)), constant_values=jnp.nan).reshape(-1, _MATCHES_PER_STEP, 4)
+    counts = jnp.pad(counts, padding).reshape(-1, _MATCHES_PER_STEP)
 
-    @jax.custom_jvp
-    def same(values: Any) -> Any:
-        return values
+    def count_step(step: Array, sums: tuple[Array, Array]) -> tuple[Array, Array]:
+        inliers, number = sums
+        for point, count in zip(points[step], counts[step], strict=True):
+            inlier = is_inlier(models, point, threshold)
+            inliers = inliers + jnp.where(inlier, count, 0.0)
+            if not each_counts_one:
+                number = number + inlier.astype(number.dtype)
+        return inliers, number
 
-    @same.defjvp
-    def refuse(*_: Any) -> Any:
-        raise NoGradientError(why)
+    zeros = jnp.zeros_like(models[0])
+    inliers, number = jax.lax.fori_loop(0, len(points), count_step, (zeros, zeros))
+    return inliers, inliers if each_counts_one else number
 
-    return same(values)
+
+def canonical_order(points: Float[Array, "slots 4"], real: Bool[Array, " slots"]) -> Int[Array, " slots"]:
+    """Slots of the real matches, sorted by a hash of their coordinates whatever their order, then padding."""
+    bits = jax.lax.bitcast_convert_type(points.astype(jnp.float32) + 0.0, jnp.uint32)  # 0 and -0 are equal
+    code = jnp.zeros(real.shape, jnp.uint32)
+    for column in range(4):  # Wellons' lowbias32, which maps no two numbers to the same
+        code = code ^ bits[:, column]
+        code = (code ^ (code >> 16)) * jnp.uint32(0x7FEB352D)
+        code = (code ^ (code >> 15)) * jnp.uint32(0x846CA68B)
+        code = code ^ (code >> 16)
+    keys = ~real, code, *bits.T  # the coordinates decide if two codes are equal
+    return jax.lax.sort((*keys, jnp.arange(len(real), dtype=jnp.int32)), num_keys=len(keys))[-1]
+
+
+def draw_four(key: Array, round_number: Int[Array, ""] | int, count: Int[Array, ""] | int) -> Int[Array, "4 draws"]:
+    """Four distinct numbers below `count` (at least 4), all sets equally likely."""
+    bits = jax.random.bits(jax.random.fold_in(key, round_number), (4, _DRAWS), jnp.uint32)
+    share = (bits >> 8).astype(jnp.float32) * 2.0**-24
+    remaining = count - jnp.arange(4, dtype=jnp.int32)  # numbers that are not taken yet
+    place = jnp.minimum((share * remaining[:, None].astype(jnp.float32)).astype(jnp.int32), remaining[:, None] - 1)
+    numbers: list[Array] = []
+    taken: list[Array] = []  # the same numbers, ascending
+    for drawn in place:
+        for other in taken:
+            drawn = drawn + (drawn >= other).astype(jnp.int32)
+        numbers.append(drawn)
+        for index, other in enumerate(taken):  # insert the number; what is larger moves on
+            taken[index], drawn = jnp.minimum(other, drawn), jnp.maximum(other, drawn)
+        taken.append(drawn)
+    return jnp.stack(numbers)
+
+
+def draw_samples(points: Float[Array, "slots 4"], key: Array, round_number: Array, count: Array) -> tuple[Array, Array]:
+    """Draw samples `[4, 4, S]`: (x1, y1, x0, y0) of four of the first `count` matches each; and their number.
+
+    As in OpenCV's findHomography, a draw is rejected if no camera can see it: three of the points lie on a line in one
+    image, or some but not all triangles change their orientation.
+    """
+    gather = lambda index: jnp.moveaxis(points.at[index].get(mode="promise_in_bounds"), 2, 0)  # noqa: E731
+    index = jax.lax.optimization_barrier(draw_four(key, round_number, count))  # each coordinate would draw again
+    x1, y1, x0, y0 = gather(index)
+    same_orientation, flat = [], []
+    for area1, area0, (corner, *ends) in zip(areas(x1, y1), areas(x0, y0), _TRIANGLES, strict=True):
+        same_orientation.append(area1 * area0 > 0)
+        for area, x, y in ((area1, x1, y1), (area0, x0, y0)):
+            sides = sum(jnp.abs(values[end] - values[corner]) for values in (x, y) for end in ends)
+            flat.append(jnp.abs(area) <= _FLAT * sides)
+    number_same = jnp.sum(jnp.stack(same_orientation), axis=0)
+    is_degenerate = ((number_same != 0) & (number_same != len(_TRIANGLES))) | jnp.any(jnp.stack(flat), axis=0)
+    valid = jnp.cumsum(~is_degenerate, dtype=jnp.int32)
+    draws = jnp.searchsorted(valid, jnp.arange(1, ROUND + 1, dtype=jnp.int32), method="scan_unrolled")
+    index = index.at[:, jnp.minimum(draws, _DRAWS - 1)].get(mode="promise_in_bounds")
+    return gather(index), jnp.minimum(valid[-1], ROUND)
+
+
+def areas(x: Float[Array, "4 ..."], y: Float[Array, "4 ..."]) -> tuple[Array, Array, Array, Array]:
+    """Twice the signed areas of the `_TRIANGLES` of four points."""
+    x, y = x - x[:1], y - y[:1]
+    a012, a013, a023 = (x[i] * y[j] - x[j] * y[i] for i, j in ((1, 2), (1, 3), (2, 3)))
+    return a012, a013, a023, a023 + a012 - a013
+
+
+def through(four: Float[Array, "coordinates=4 matches=4 samples"]) -> Float[Array, "9 samples"]:
+    """Homographies through four matches (x1, y1, x0, y0).
+
+    No three points may lie on a line. The fourth point of the candidate is p_3 = sum_i l_i p_i, where the l_i are
+    ratios of triangles; in the query, q_3 = sum_i m_i q_i. A map from p_i to (m_i / l_i) q_i for i < 3 also maps p_3 to
+    q_3. Hence H = sum_i (m_i / l_i) q_i r_i^T, where the r_i are the rows of the inverse of (p_0 p_1 p_2): the lines
+    through two of these points. H is multiplied by l_0 l_1 l_2, so that it needs no division.
+    """
+
+    def shares(x: Array, y: Array) -> tuple[Array, Array, Array]:
+        """The ratios of the fourth point, up to a common factor that avoids underflow."""
+        _, a013, a023, a123 = areas(x, y)
+        size = jnp.abs(a013) + jnp.abs(a023) + jnp.abs(a123)
+        return a123 / size, -a023 / size, a013 / size
+
+    x1, y1, x0, y0 = four
+    (l0, l1, l2), (m0, m1, m2) = shares(x1, y1), shares(x0, y0)
+    scales = m0 * l1 * l2, m1 * l0 * l2, m2 * l0 * l1
+    x, y, u, v = (values - values[:1] for values in four)  # the first point is the origin of both images
+    scales, x, y, u, v = jax.lax.optimization_barrier((scales, x, y, u, v))  # each entry would recompute them
+    lines = (y[1] - y[2], x[2] - x[1], x[1] * y[2] - x[2] * y[1]), (y[2], -x[2]), (-y[1], x[1])
+    top, middle = (
+        [scales[1] * side[1] * lines[1][column] + scales[2] * side[2] * lines[2][column] for column in (0, 1)]
+        for side in (u, v)
+    )
+    bottom = [sum(scale * line[column] for scale, line in zip(scales, lines, strict=True)) for column in (0, 1)]
+    last = scales[0] * lines[0][2]
+    # From coordinates relative to the first point back to those of the frame.
+    last = last - bottom[0] * x1[0] - bottom[1] * y1[0]
+    bottom = [*bottom, last]
+    rows = [[*side, -side[0] * x1[0] - side[1] * y1[0]] for side in (top, middle)]
+    model = [
+        value + origin * base
+        for row, origin in zip(rows, (x0[0], y0[0]), strict=True)
+        for value, base in zip(row, bottom, strict=True)
+    ]
+    size = jnp.abs(bottom[0]) + jnp.abs(bottom[1]) + jnp.abs(bottom[2])
+    return jnp.stack([*model, *bottom]) / size[None]  # NaN if all entries are 0: a model of zeros would have no errors
+
+
+def is_inlier(model: Array, points: Array, threshold: Array) -> Array:
+    """Whether H p1 is within the threshold of p0: models `[9, ...]` and a match `[4]`, or a model and matches."""
+    x1, y1, x0, y0 = jnp.moveaxis(points, -1, 0)
+    u, v, w = (model[row] * x1 + model[row + 1] * y1 + model[row + 2] for row in (0, 3, 6))
+    u, v, limit = u - x0 * w, v - y0 * w, threshold * w  # both sides times the last coordinate of H p1
+    return u * u + v * v <= limit * limit
+
+
+def least_squares(model: Float[Array, "9"], points: Float[Array, "slots 4"], weights: Array) -> Float[Array, "9"]:
+    """Model with the least weighted squared error for matches."""
+    x1, y1, x0, y0 = points.T
+    plane, target, roots = jnp.stack([x1, y1, jnp.ones_like(x1)]), jnp.stack([x0, y0]), jnp.sqrt(weights)
+
+    def errors_of(free: Float[Array, "8"]) -> Float[Array, " errors"]:
+        u, v, w = jnp.matmul(jnp.append(free, 1.0).reshape(3, 3), plane, precision=_EXACT)
+        return ((jnp.stack([u, v]) / w[None] - target) * roots[None]).reshape(-1)
+
+    def step(_: int, state: tuple[Array, Array]) -> tuple[Array, Array]:
+        free, damping = state
+        errors, slopes = errors_of(free), jax.jacfwd(errors_of)(free)
+        square = jnp.matmul(slopes.T, slopes, precision=_EXACT)
+        square = square + jnp.diag(damping * jnp.diag(square) + _MIN_CURVATURE)
+        change = jnp.linalg.solve(square, jnp.matmul(errors, slopes, precision=_EXACT))
+        is_better = jnp.sum(errors_of(free - change) ** 2) < jnp.sum(errors**2)
+        return jnp.where(is_better, free - change, free), damping * jnp.where(is_better, 0.1, 10.0)
+
+    start = model[:8] / model[8], jnp.asarray(1e-3, model.dtype)
+    return jnp.append(jax.lax.fori_loop(0, _STEPS, step, start)[0], 1.0)
+
+
+class Frame(NamedTuple):
+    """Coordinates in which the points of images lie within -1 and 1; one far point costs the others no digits."""
+
+    center: Float[Array, "4"]  # px
+    scale: Float[Array, "2"]  # px
+
+    @classmethod
+    def of(cls, size1: Num[Array, "2"], size0: Num[Array, "2"], dtype: Any) -> "Frame":
+        """Frame of images with these sizes in px; an invalid size leaves coordinates as they are."""
+        sizes = jnp.stack([jnp.asarray(size, dtype) for size in (size1, size0)])
+        half = jnp.where(jnp.isfinite(sizes) & (sizes > 0), sizes, 0.0) / 2
+        scale = jnp.max(half, axis=1)
+        return cls(half.reshape(4), jnp.where(scale > 0, scale, 1.0))
+
+    def normalize(self, points: Float[Array, "slots 4"]) -> Float[Array, "slots 4"]:
+        return (points - self.center[None]) / jnp.repeat(self.scale, 2)[None]
+
+    def to_pixels(self, model: Float[Array, "9"]) -> Float[Array, "3 3"]:
+        """Matrix in px, last entry 1, of a model in the coordinates of the frame."""
+        (x1, y1, x0, y0), (scale1, scale0) = self.center, self.scale
+        zero, unit = jnp.zeros_like(x1), jnp.ones_like(x1)
+        enter = jnp.stack([unit, zero, -x1, zero, unit, -y1, zero, zero, scale1]).reshape(3, 3)
+        leave = jnp.stack([scale0, zero, x0, zero, scale0, y0, zero, zero, unit]).reshape(3, 3)
+        matrix = jnp.matmul(jnp.matmul(leave, model.reshape(3, 3), precision=_EXACT), enter, precision=_EXACT)
+        return matrix / matrix[2, 2]
 
 
 @value
@@ -206,10 +373,9 @@ class OpenCvHomography:
 
         mfvpr.score_candidates(mfvpr.OpenCvHomography(), candidate_matches)  # [C]
 
-    The score runs on the host: all functions of the library accept it, but `jit`, `vmap` and gradients do not. (JAX's
-    callbacks may deadlock.) OpenCV's samples depend on the order of the matches, so that matches are sorted by
-    `index0`, or by their coordinates without it. A match of confidence 0 is ignored, all others count fully. OpenCV 4
-    counts the inliers before its last least squares, version 5 after it.
+    The score runs on the host: all functions of the library accept it, but `jit`, `vmap` and gradients do not. Matches
+    are sorted by `index0`, or by their coordinates without it, since OpenCV's samples depend on their order. A match of
+    confidence 0 is ignored, all others count fully. OpenCV 4 counts inliers before its last least squares, 5 after it.
 
     Attributes:
         threshold: largest error of an inlier, px of the query; 8 and 24 in the paper.
@@ -230,19 +396,16 @@ class OpenCvHomography:
     def __call__(self, matches: Matches) -> Float[np.ndarray, ""]:
         """Score of one pair `[K]`, float32; an `InputError` if anything is traced, or a number is out of bounds."""
         if not is_concrete((self, matches)):
-            raise InputError(
-                "homography_opencv: expected matches that neither jit nor vmap nor grad traces, since "
-                "OpenCV runs outside of JAX; call score_candidates, or take Homography"
-            )
+            expected = "expected matches that neither jit nor vmap nor grad traces"
+            raise InputError(f"homography_opencv: {expected}; call score_candidates, or take Homography")
         check_bounds(self)  # OpenCV replaces a threshold of 0 by 3 px
         points = np.concatenate([matches.points1, matches.points0], axis=-1, dtype=np.float32, casting="unsafe")
-        real = np.asarray(matches.mask)
-        if matches.confidence is not None:
-            if np.isnan(np.asarray(matches.confidence)[real]).any():
-                return np.array(np.nan, np.float32)
-            real = real & (np.asarray(matches.confidence) > 0)
+        real = np.asarray(matches.mask, bool)
+        confidence = np.ones(len(real)) if matches.confidence is None else np.asarray(matches.confidence)
+        has_nan = np.isnan(confidence[real]).any()
+        real = real & (confidence > 0)
         points = points[real]
-        if not np.isfinite(points).all():
+        if has_nan or not np.isfinite(points).all():
             return np.array(np.nan, np.float32)
         if len(points) < 4:
             return np.array(len(points) if self.few == "count" else 0, np.float32)

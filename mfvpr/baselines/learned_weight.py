@@ -36,9 +36,8 @@ WORDS = (*WEIGHTS, *_LEARNED)
 class LearnedWeight:
     """Learned match weight w = softplus(z), z = v . tanh(x M + b) + c, above 0, without unit.
 
-    x are the standardized inputs of a match. `center` and `scale` are statistics without gradient, so that an optimizer
-    does not change them. Exclude them from weight decay with `optax.masked`. A weight with the input `ratio` raises an
-    InputError for matches without a ratio.
+    x are the standardized inputs of a match. `center` and `scale` are statistics without gradient; exclude them from
+    weight decay with `optax.masked`. The input `ratio` raises an InputError for matches without a ratio.
 
     `names` are some of `INPUTS`. RELATIVE inputs compare a match with the other matches of its pair, so that they carry
     over to other detectors, cameras and places; ABSOLUTE inputs have their units.
@@ -96,13 +95,8 @@ class LearnedWeight:
 
 
 def _raw_inputs(matches: Matches, names: tuple[str, ...]) -> Float[Array, "*batch slots inputs"]:
-    """Inputs that are not standardized; 0 on padding."""
     columns = [masked(jnp.broadcast_to(INPUTS[name](matches), matches.mask.shape), matches.mask) for name in names]
     return jnp.stack(columns, axis=-1)
-
-
-def _field(name: str, matches: Matches) -> Array:
-    return as_float(getattr(matches, name))
 
 
 def _rank(name: str, matches: Matches) -> Array:
@@ -113,7 +107,7 @@ def _rank(name: str, matches: Matches) -> Array:
         below, up_to = (jnp.searchsorted(ordered, values, side=side) for side in ("left", "right"))
         return (below + up_to).astype(values.dtype) / (2 * jnp.maximum(jnp.sum(mask), 1)).astype(values.dtype)
 
-    values = masked(_field(name, matches), matches.mask)
+    values = masked(as_float(getattr(matches, name)), matches.mask)
     return jax.lax.stop_gradient(jnp.vectorize(of_pair, signature="(k),(k)->(k)")(values, matches.mask))
 
 
@@ -138,9 +132,9 @@ INPUTS: Mapping[str, Callable[[Matches], Any]] = {
     "relative_distance": _relative_distance,
     "score0_rank": partial(_rank, "scores0"),
     "score1_rank": partial(_rank, "scores1"),
-    "scores0": partial(_field, "scores0"),
-    "scores1": partial(_field, "scores1"),
-    "distance": partial(_field, "distance"),
+    "scores0": lambda matches: as_float(matches.scores0),
+    "scores1": lambda matches: as_float(matches.scores1),
+    "distance": lambda matches: as_float(matches.distance),
     "x0": partial(_coordinate, 0, 0),
     "y0": partial(_coordinate, 0, 1),
     "x1": partial(_coordinate, 1, 0),

@@ -2,7 +2,7 @@
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 
 from mfvpr.core.types import Array, Matches, value
 from mfvpr.core.weights import image_sizes, match_confidence, match_shifts
@@ -46,27 +46,22 @@ class RapidSpatialScore:
         """Score of one pair `[K]`, float32; an InputError if `per_feature` is set and the matches have no `count0`."""
         confidence, shifts = match_confidence(matches), match_shifts(matches)
         residuals = jnp.abs(shifts - masked_mean(shifts, matches.mask, confidence)[None])
-        closeness = self._reach(matches, shifts, confidence > 0)[None] - residuals
+        if self.size is not None:
+            reach = jnp.asarray(self.size, shifts.dtype)
+        elif self.reach == "image_size":
+            reach = image_sizes(matches)[0]
+        else:
+            real = confidence > 0
+            largest = lambda values: jnp.max(masked(values, real, -jnp.inf), axis=0, initial=-jnp.inf)  # noqa: E731
+            sides = (masked(at_least_single(points), matches.mask) for points in (matches.points0, matches.points1))
+            of_shift = self.reach == "largest_shift"
+            reach = jnp.abs(largest(shifts)) if of_shift else jnp.maximum(*map(largest, sides))
+            reach = jnp.where(jnp.any(real), reach, 0.0)
+        closeness = reach[None] - residuals
         score = jnp.sum(confidence * jnp.sum(masked(closeness, matches.mask) ** 2, axis=-1))
         if self.per_feature:
             score = score / query_features(matches)
         return where_finite(score, confidence, shifts)
-
-    def _reach(
-        self, matches: Matches, shifts: Float[Array, "slots 2"], real: Bool[Array, " slots"]
-    ) -> Float[Array, "2"]:
-        """X and Y; 0 if they are a maximum over no matches."""
-        if self.size is not None:
-            return jnp.asarray(self.size, shifts.dtype)
-        if self.reach == "image_size":
-            return image_sizes(matches)[0]
-        largest = lambda values: jnp.max(masked(values, real, -jnp.inf), axis=0, initial=-jnp.inf)  # noqa: E731
-        if self.reach == "largest_shift":
-            reach = jnp.abs(largest(shifts))
-        else:
-            points = (masked(at_least_single(points), matches.mask) for points in (matches.points0, matches.points1))
-            reach = jnp.maximum(*map(largest, points))
-        return jnp.where(jnp.any(real), reach, 0.0)
 
 
 def query_features(matches: Matches) -> Float[jax.Array, ""]:
@@ -137,9 +132,8 @@ class LostScore:
     1 / (e^s - 1). LoST also multiplies L by the distance of the images' global descriptors, which matches do not hold,
     and matches by channels and semantic labels.
 
-    If all distances are equal, for instance of a single match, v is 0 and L infinite, so that s = 0. Two matches are
-    always perfect: with few matches the score says little. 1 - cos is at least 1e-12, and 1 if all positions with a
-    weight are 0.
+    If all distances are equal, v is 0 and L infinite, so that s = 0. Two matches are always perfect. 1 - cos is at
+    least 1e-12, and 1 if all positions with a weight are 0.
 
     Attributes:
         form: `weighted` is the L above; `unweighted` is (1 - cos(x0, x1)) / n, LoST's program without descriptors of
@@ -175,9 +169,7 @@ class LostScore:
         return where_finite(score, confidence, x0, x1, distance)
 
 
-def _cosine_distance(
-    x0: Float[Array, " slots"], x1: Float[Array, " slots"], weights: Float[Array, " slots"]
-) -> Float[Array, ""]:
+def _cosine_distance(x0: Float[Array, " slots"], x1: Array, weights: Array) -> Float[Array, ""]:
     """1 - cos of two vectors with weights; 1 if one of the vectors is 0."""
     length0, length1 = (safe_sqrt(jnp.sum(weights * x**2)) for x in (x0, x1))
     usable = (length0 > 0) & (length1 > 0)

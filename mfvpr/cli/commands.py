@@ -25,11 +25,11 @@ from mfvpr.datasets.ground_truth import middle, threshold_words
 from mfvpr.datasets.published import PUBLISHED, published_differences
 from mfvpr.io import read_stamps, stamps_in_names
 from mfvpr.io.containers import reading
-from mfvpr.report import Table, prediction_files
+from mfvpr.report import Table, run_files
 from mfvpr.report.evaluations import sequence_folder
 from mfvpr.report.figures import contact_sheet
 from mfvpr.report.pages import write_comparison, write_report
-from mfvpr.report.prediction_files import LocalizedImage
+from mfvpr.report.run_files import LocalizedImage
 from mfvpr.report.runs import file_names
 from mfvpr.storage import FeatureCache
 from mfvpr.utils import InputError
@@ -231,7 +231,7 @@ def convert(
         if layout in _CANDIDATES:
             raise InputError(f"{source}: expected the run folder of mfvpr evaluate for --layout {layout}, got a file")
         names = image_folder(database).names if database else ()
-        _write_localized(out, layout, prediction_files.read_lines(source), poses, names, times)
+        _write_localized(out, layout, run_files.read_lines(source), poses, names, times)
         return
     with reading(source / "run.json", mend="expected the folder of an evaluation"):
         about: Any = json.loads((source / "run.json").read_text("utf-8"))
@@ -245,15 +245,15 @@ def convert(
     for place, sequence in enumerate(dataset.sequences):
         target = out / file_names(names)[sequence.name] if len(names) > 1 else out
         queries = sequence_folder(source, names, place)
-        images = prediction_files.read_run_images(queries, sequence.images.names)
+        images = run_files.read_run_images(queries, sequence.images.names)
         if layout not in _CANDIDATES:
             _write_localized(target, layout, images, poses, dataset.database.names, times)
             continue
-        shortlist, positives = prediction_files.shortlist_of(images, dataset.database.names), None
+        shortlist, positives = run_files.shortlist_of(images, dataset.database.names), None
         if sequence.truth and thresholds and settings["dataset"].get("exclude_neighbors") is None:  # else not correct
             positives = sequence.truth.positives(middle(thresholds))
         sides, prefixes = (sequence.images, dataset.database), (query_prefix, database_prefix)
-        prediction_files.write_candidates(target, shortlist, *sides, layout, positives, prefixes=prefixes)
+        run_files.write_candidates(target, shortlist, *sides, layout, positives, prefixes=prefixes)
         print(printable(f"{target}: candidates of {int(shortlist.mask.any(axis=1).sum())} queries"))
 
 
@@ -268,8 +268,8 @@ def _write_localized(
     names = [image.name for image in images]
     stamps = [] if layout == "kitti" else read_stamps(times, len(names)) if times else stamps_in_names(names)
     if layout == "shifts":
-        prediction_files.write_shift_table(path, images, stamps)
+        run_files.write_shift_table(path, images, stamps)
     elif poses is not None:
-        prediction_files.write_poses(path, images, poses, database, None if layout == "kitti" else stamps)
+        run_files.write_poses(path, images, poses, database, None if layout == "kitti" else stamps)
     num_places = sum(image.place is not None for image in images)
     print(printable(f"{path}: {num_places} images with a place, {len(images) - num_places} without"))

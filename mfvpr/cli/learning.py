@@ -18,7 +18,7 @@ from mfvpr.cli.sweeping import axes_of
 from mfvpr.datasets.contents import own_rows
 from mfvpr.evaluation.dataset_ranking import matches_recipe
 from mfvpr.matchers import Scales
-from mfvpr.report import comparisons, runs
+from mfvpr.report import runs, searches
 from mfvpr.systems.assembly import without
 from mfvpr.tuning.learning.models import LOSSES, Options, compare
 from mfvpr.tuning.learning.splits import Part, join_data_sets
@@ -77,7 +77,7 @@ def learn(settings: Learn) -> None:
         heading = (
             f"{names}: {score_in_words(settings)}, learned here and reported on {words}; {truth_in_words(*truths)}"
         )
-        text = f"{heading}\n\n{comparisons.comparison_text(comparison)}"
+        text = f"{heading}\n\n{searches.comparison_text(comparison)}"
         left_out = ("dataset", "cache", "out", "checkpoints", "cluster", "compiled")
         about, ground_truth = teach[0].inputs.about, teach[0].inputs.ground_truth
         if report:
@@ -86,21 +86,21 @@ def learn(settings: Learn) -> None:
             ground_truth = {each.part.name: each.inputs.ground_truth for each in report}
         results = {
             **about,
-            **comparisons.comparison_json(comparison),
+            **searches.comparison_json(comparison),
             "settings": without(to_values(settings), *left_out),
             "seconds": watch.seconds,
             "versions": versions(),
         }
 
         def write(new: Path) -> None:
-            runs.write_table(new, comparisons.comparison_table(comparison), heading)
+            runs.write_table(new, searches.comparison_table(comparison), heading)
             runs.write_json(new / "results.json", results)
             origin = {"command": settings.command, "commit": runs.commit(Path())}
             origin |= without(results, "rows", "queries", "seconds")
-            comparisons.write_weights(new / "weights", comparison, origin)
+            searches.write_weights(new / "weights", comparison, origin)
             write_text(new / "summary.txt", f"{text}\n")
 
-        figures = comparisons.comparison_figures(comparison)
+        figures = searches.comparison_figures(comparison)
         jobs.write_results(folder, settings, ground_truth, text=text, write=write, figures=figures)
 
 

@@ -17,9 +17,9 @@ from mfvpr.evaluation.drives import DriveFilter
 from mfvpr.evaluation.protocol import Split
 from mfvpr.evaluation.rankings import RETRIEVAL
 from mfvpr.features import Aggregated, Sift, VladFitting
-from mfvpr.report import sweeps
+from mfvpr.report import searches
 from mfvpr.report.runs import LAST
-from mfvpr.report.sweeps import Sweep, axes_json
+from mfvpr.report.searches import Sweep, as_json
 from mfvpr.retrieval import Retrieval
 from mfvpr.storage import FeatureCache
 from mfvpr.systems import assembly
@@ -67,15 +67,15 @@ def sweep_program(settings: Settings) -> None:
         )
         values = to_values(settings)
         names = ("scorer", "features", "retrieval", "matching", "candidates", "fusion", "final", "sequence")
-        results = {**inputs.about, **{name: values[name] for name in names}, **sweeps.sweep_json(outcome)}
-        results |= {"seconds": watch.seconds, "versions": versions()}
+        about = {**inputs.about, **{name: values[name] for name in names}}
+        about |= {"seconds": watch.seconds, "versions": versions()}
         jobs.write_results(
             folder,
             settings,
             inputs.ground_truth,
-            text=sweeps.sweep_summary(outcome, heading),
-            write=lambda new: sweeps.write_sweep(new, outcome, heading, results),
-            figures=sweeps.sweep_figures(outcome),
+            text=searches.sweep_summary(outcome, heading),
+            write=lambda new: searches.write_sweep(new, outcome, heading, about),
+            figures=searches.sweep_figures(outcome),
         )
         outcome.forget_rankings(matches, candidates, options)
 
@@ -189,7 +189,7 @@ def _ranking_folder(out: Path, axes: Axes) -> Path:
     rankings, results = out / "rankings", out / LAST
     if not rankings.is_dir() and out.exists() and (not out.is_dir() or any(out.iterdir())):
         raise InputError(f"out={out}: expected a new or empty folder, or one of a sweep; name another")
-    if results.exists() and json.loads(results.read_text("utf-8"))["axes"] != axes_json(axes):
+    if results.exists() and json.loads(results.read_text("utf-8"))["axes"] != as_json(axes.values):
         raise InputError(f"out={out}: has the result of a sweep of other axes; name another folder")
     rankings.mkdir(parents=True, exist_ok=True)
     return rankings

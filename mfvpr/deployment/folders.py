@@ -4,7 +4,7 @@ import json
 import logging
 import re
 import warnings
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from functools import partial
 from importlib.util import find_spec
@@ -23,7 +23,7 @@ from mfvpr.deployment.programs import ExportShapes, Program, Tensor, make_progra
 from mfvpr.evaluation.system import System
 from mfvpr.io.containers import reading
 from mfvpr.utils.errors import InputError
-from mfvpr.utils.files import require_file, write_text
+from mfvpr.utils.files import write_text
 from mfvpr.utils.fingerprints import recipe_of, versions
 from mfvpr.utils.numerics import as_array
 
@@ -35,48 +35,37 @@ TOLERANCE = 1e-4  # of ONNX Runtime, which sums in another order: relative to ou
 
 @dataclass(frozen=True)
 class ExportedProgram:
-    """A program of a folder. Call it with an array for each input.
-
-        program = mfvpr.load_exported("exported")
-        scores = program(**arrays)["scores"]  # arrays as program.inputs says
-
-    Attributes:
-        folder: the program's.
-        inputs: name, shape, dtype, unit and axes of each array that the program takes.
-        outputs: the same of each array that it returns.
-        description: content of `export.json`.
-    """
+    """A program of a folder, called with an array for each input: `program(**arrays)["scores"]`."""
 
     folder: Path
-    inputs: tuple[Tensor, ...]
-    outputs: tuple[Tensor, ...]
-    description: Mapping[str, Any] = field(repr=False)
+    inputs: tuple[Tensor, ...]  # name, shape, dtype, unit and axes of each array that the program takes
+    outputs: tuple[Tensor, ...]  # the same of each array that it returns
+    description: Mapping[str, Any] = field(repr=False)  # content of `export.json`
     run: Callable[..., tuple[Array, ...]] = field(repr=False)
 
     def __call__(self, **arrays: Any) -> dict[str, np.ndarray]:
         """Outputs by name, NumPy.
 
-        Raises an `InputError` if an array is missing or has another shape or dtype, or if an image size that the
-        program takes is not above 0, or is too small for the points: by more than 2 px and 1 %.
+        An `InputError` if an array is missing or has another shape or dtype, or if an image size that the program takes
+        is not above 0, or is too small for the points: by more than 2 px and 1 %.
         """
         if arrays.keys() != (expected := {each.name: each for each in self.inputs}).keys():
             raise InputError(f"inputs: expected {', '.join(expected)}, got {', '.join(arrays) or 'none'}")
-        values = {name: np.asarray(as_array(array)) for name, array in arrays.items()}
-        for name, each in expected.items():
-            got = values[name]
-            if (str(got.dtype), got.shape) != (each.dtype, each.shape):
-                raise InputError(f"{name}: expected {each.dtype} {[*each.shape]}, got {got.dtype} {[*got.shape]}")
+        values = {name: np.asarray(as_array(arrays[name])) for name in expected}
+        for name, got in values.items():
+            dtype, shape = expected[name].dtype, expected[name].shape
+            if (str(got.dtype), got.shape) != (dtype, shape):
+                raise InputError(f"{name}: expected {dtype} {[*shape]}, got {got.dtype} {[*got.shape]}")
         _require_sizes(values)
-        outputs = self.run(*(values[each.name] for each in self.inputs))
-        return {each.name: np.asarray(array) for each, array in zip(self.outputs, outputs, strict=True)}
+        outputs = map(np.asarray, self.run(*values.values()))
+        return dict(zip((each.name for each in self.outputs), outputs, strict=True))
 
     def check(self) -> float:
         """Largest difference from the outputs in the folder, relative where they are above 1."""
-        inputs, outputs = (
-            {each.name: np.load(self.folder / CHECK / f"{each.name}.npy", allow_pickle=False) for each in tensors}
-            for tensors in (self.inputs, self.outputs)
-        )
-        return largest_difference(self(**inputs), outputs)
+        names = [each.name for each in (*self.inputs, *self.outputs)]
+        arrays = {name: np.load(self.folder / CHECK / f"{name}.npy", allow_pickle=False) for name in names}
+        expected = {each.name: arrays.pop(each.name) for each in self.outputs}
+        return largest_difference(self(**arrays), expected)
 
 
 def export(
@@ -110,12 +99,12 @@ def export(
     folder = Path(folder)
     if folder.exists() and not (folder.is_dir() and not any(folder.iterdir())):
         raise InputError(f"{folder}: expected a new or an empty folder; choose a new path")
-    options = {"with_shift": with_shift, "with_confidence": with_confidence}
     with jax.enable_x64(False):
-        program = without_unused_inputs(make_program(method, shapes, **options))
+        program = make_program(method, shapes, with_shift=with_shift, with_confidence=with_confidence)
+        program = without_unused_inputs(program)
         content = bytes(export_program(program).serialize())
         inputs = check_inputs(program)
-        values = jax.jit(deserialize(content, str(folder)).call)(*inputs.values())
+        values = jax.jit(jax_export.deserialize(bytearray(content)).call)(*inputs.values())
         outputs = {each.name: np.asarray(array) for each, array in zip(program.outputs, values, strict=True)}
         model, onnx_note = None, {"missing": "not requested" if onnx is False else "jax2onnx is not installed"}
         if onnx or (onnx is None and find_spec("jax2onnx")):
@@ -156,29 +145,22 @@ def export(
 
 
 def load_exported(folder: Path | str) -> ExportedProgram:
-    """Load a program that `export` wrote.
+    """Load a program that `export` wrote, on this or on another computer.
 
         mfvpr.export("count", mfvpr.MatchCount(), mfvpr.ExportShapes(50, 800, (640, 480)), onnx=False)
         mfvpr.load_exported("count")(mask=np.ones((50, 800), bool))["scores"]  # [C]
 
-    Args:
-        folder: of `export`, on this or on another computer.
-
-    Raises:
-        InputError: a file is missing, or this version of JAX cannot read the program.
+    An `InputError` if a file is missing, or if this version of JAX cannot read the program.
     """
     folder = Path(folder)
-    require_file(path := folder / DESCRIPTION, "a folder of mfvpr.export with this file")
-    require_file(folder / PROGRAM)
-    with reading(path, mend="export it again"):
-        description = json.loads(path.read_text(encoding="utf-8"))
+    with reading(folder / DESCRIPTION, "a folder of mfvpr.export with this file", "export it again"):
+        description = json.loads((folder / DESCRIPTION).read_text(encoding="utf-8"))
         if description["format"] != FORMAT:
             raise InputError(f"expected the format {FORMAT!r}; export it again with this version")
-    exported = deserialize((folder / PROGRAM).read_bytes(), str(folder / PROGRAM))
-    inputs, outputs = (
-        tuple(Tensor(**entry | {"shape": tuple(entry["shape"])}) for entry in description[side])
-        for side in ("inputs", "outputs")
-    )
+        tensors = [description["inputs"], description["outputs"]]
+        inputs, outputs = (tuple(Tensor(**each | {"shape": tuple(each["shape"])}) for each in side) for side in tensors)
+    with reading(folder / PROGRAM, mend=f"expected a program that JAX {jax.__version__} reads; export it again"):
+        exported = jax_export.deserialize(bytearray((folder / PROGRAM).read_bytes()))
     return ExportedProgram(folder, inputs, outputs, description, jax.jit(exported.call))
 
 
@@ -196,9 +178,9 @@ def without_unused_inputs(program: Program) -> Program:
 def export_program(program: Program) -> jax_export.Exported:
     """Export for all platforms; an InputError names operations that the program cannot have."""
     _require("flatbuffers", "export")
-    function = jax.jit(lambda *arrays: program.call(*arrays))
+    structs = [jax.ShapeDtypeStruct(each.shape, each.dtype) for each in program.inputs]
     try:
-        exported = jax_export.export(function, platforms=PLATFORMS)(*_shape_structs(program.inputs))
+        exported = jax_export.export(jax.jit(lambda *arrays: program.call(*arrays)), platforms=PLATFORMS)(*structs)
         calls = {*re.findall(r"custom_call @([\w.]+)", exported.mlir_module())}
     except InputError:
         raise
@@ -212,23 +194,13 @@ def export_program(program: Program) -> jax_export.Exported:
     return exported
 
 
-def deserialize(content: bytes, where: str) -> jax_export.Exported:
-    """The serialized program; an InputError, which begins with `where`, if JAX cannot read it."""
-    _require("flatbuffers", "export")
-    try:
-        return jax_export.deserialize(bytearray(content))
-    except Exception as error:  # of flatbuffers, of MLIR, or of JAX's own checks
-        expected = f"a program that JAX {jax.__version__} reads"
-        raise InputError(f"{where}: expected {expected}, got {_one_line(error)}") from error
-
-
 def to_onnx(program: Program, inputs: dict[str, np.ndarray], outputs: dict[str, np.ndarray]) -> tuple[bytes, float]:
     """The program as an ONNX model, and the largest difference of its outputs in ONNX Runtime from JAX's.
 
     An InputError if jax2onnx or ONNX Runtime lacks an operation, or if the difference is above the tolerance.
     """
     _require("jax2onnx", "onnx=True")
-    structs = _shape_structs(program.inputs)
+    structs = [jax.ShapeDtypeStruct(each.shape, each.dtype) for each in program.inputs]
     # jax2onnx traces functions of jax.numpy in its own way, which lacks options; a jaxpr has plain operations.
     function = jaxpr_as_fun(jax.make_jaxpr(partial(program.call, form="loop"))(*structs))
     names = {"model_name": "mfvpr", "input_names": [*inputs], "output_names": [*outputs]}
@@ -256,56 +228,50 @@ def to_onnx(program: Program, inputs: dict[str, np.ndarray], outputs: dict[str, 
 def _require_sizes(arrays: Mapping[str, np.ndarray]) -> None:
     """Raise an InputError for sizes of images that cannot be right, as width and height exchanged often cannot."""
     for side in "01":
-        name, sizes = f"image_size{side}", arrays.get(f"image_size{side}")
-        mask = arrays.get("mask", arrays.get(f"mask{side}"))
+        sizes, mask = arrays.get(f"image_size{side}"), arrays.get("mask", arrays.get(f"mask{side}"))
         if sizes is None or mask is None:
             continue
         sizes = np.broadcast_to(sizes[..., None, :], (*mask.shape, 2))[mask]
         points = arrays.get(f"points{side}", arrays.get(f"keypoints{side}"))
         points = np.zeros_like(sizes) if points is None else points[mask]
         margin = np.maximum(2.0, 0.01 * sizes)
-        wrong = ~(sizes > 0) | (points < -margin) | (points > sizes + margin)
+        wrong = (~(sizes > 0) | (points < -margin) | (points > sizes + margin)).any(axis=1)
         if wrong.any():
-            row = int(wrong.any(axis=1).argmax())
-            got = f"{sizes[row].tolist()} with a point {points[row].tolist()}"
-            raise InputError(f"{name}: expected (width, height) of images that contain all points, got {got}")
+            got = f"{sizes[wrong][0].tolist()} with a point {points[wrong][0].tolist()}"
+            raise InputError(f"image_size{side}: expected (width, height) of images that contain all points, got {got}")
 
 
 def check_inputs(program: Program) -> dict[str, np.ndarray]:
     """Inputs by name: candidates of one place, each less precise than the one before, the last without matches."""
-    shapes = program.shapes
-    rng, size = np.random.default_rng(0), np.asarray(shapes.image_size, np.float32)
-    lengths, dimension = (shapes.candidates, shapes.keypoints), shapes.dimension or 1
-    spread = 0.01 * (1 + np.arange(shapes.candidates))[:, None, None]  # of image size and descriptors
-    points0 = rng.uniform(size=(shapes.keypoints, 2)) * size
-    points1 = np.clip(points0 + 0.05 * size + spread * size * rng.normal(size=(*lengths, 2)), 0, size)
-    descriptors0 = rng.normal(size=(shapes.keypoints, dimension))
-    descriptors0 /= np.linalg.norm(descriptors0, axis=-1, keepdims=True)
-    descriptors1 = descriptors0 + spread * rng.normal(size=(*lengths, dimension))
-    descriptors1 /= np.linalg.norm(descriptors1, axis=-1, keepdims=True)
-    mask, numbers = rng.uniform(size=lengths) < 0.9, np.arange(shapes.keypoints)
-    mask[-1] = shapes.candidates == 1
-    of_matches = {
+    lengths = num_candidates, num_keypoints = program.shapes.candidates, program.shapes.keypoints
+    rng, size = np.random.default_rng(0), np.asarray(program.shapes.image_size, np.float32)
+    spread = 0.01 * (1 + np.arange(num_candidates))[:, None, None]  # of image size and descriptors
+    points = rng.uniform(size=(num_keypoints, 2)) * size
+    moved = np.clip(points + 0.05 * size + spread * size * rng.normal(size=(*lengths, 2)), 0, size)
+    descriptors = rng.normal(size=(num_keypoints, program.shapes.dimension or 1))
+    descriptors /= np.linalg.norm(descriptors, axis=-1, keepdims=True)
+    changed = descriptors + spread * rng.normal(size=(num_candidates, *descriptors.shape))
+    mask = rng.uniform(size=lengths) < 0.9
+    mask[-1] = num_candidates == 1
+    values = {
         "distance": rng.uniform(0, 1, lengths),
         "ratio": rng.uniform(0.5, 1, lengths),
         "confidence": np.linspace(0, 1, mask.size).reshape(lengths),
+        "points0": points,
+        "points1": moved,
+        "descriptors0": descriptors,
+        "descriptors1": changed / np.linalg.norm(changed, axis=-1, keepdims=True),
+        "scores0": rng.uniform(0.1, 1, num_keypoints),
+        "scores1": rng.uniform(0.1, 1, lengths),
         "mask": mask,
+        "mask0": rng.uniform(size=num_keypoints) < 0.9,
+        "mask1": mask,
     }
-    sides = {
-        "points": (points0, points1),
-        "keypoints": (points0, points1),
-        "descriptors": (descriptors0, descriptors1),
-        "scores": (rng.uniform(0.1, 1, shapes.keypoints), rng.uniform(0.1, 1, lengths)),
-        "mask": (rng.uniform(size=shapes.keypoints) < 0.9, mask),
-        "image_size": (size, size),
-        "index": (numbers, numbers),
-        "count": (shapes.keypoints, shapes.keypoints),
-    }
-    values = of_matches | {f"{name}{side}": array for name, pair in sides.items() for side, array in enumerate(pair)}
-    return {
-        each.name: np.array(np.broadcast_to(values[each.name], each.shape), each.dtype, order="C")
-        for each in program.inputs
-    }
+    for side in "01":
+        values |= {f"keypoints{side}": values[f"points{side}"], f"image_size{side}": size}
+        values |= {f"index{side}": np.arange(num_keypoints), f"count{side}": num_keypoints}
+    arrays = {each: np.broadcast_to(values[each.name], each.shape) for each in program.inputs}
+    return {each.name: np.array(array, each.dtype, order="C") for each, array in arrays.items()}
 
 
 def largest_difference(arrays: dict[str, np.ndarray], expected: dict[str, np.ndarray]) -> float:
@@ -317,10 +283,6 @@ def largest_difference(arrays: dict[str, np.ndarray], expected: dict[str, np.nda
         difference = np.abs(arrays[name][finite] - values[finite]) / np.maximum(np.abs(values[finite]), 1)
         differences.append(float(np.max(difference, initial=0.0)))
     return max(differences)
-
-
-def _shape_structs(tensors: Sequence[Tensor]) -> list[jax.ShapeDtypeStruct]:
-    return [jax.ShapeDtypeStruct(each.shape, each.dtype) for each in tensors]
 
 
 def _require(package: str, what: str) -> None:

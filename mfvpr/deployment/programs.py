@@ -1,7 +1,7 @@
 """Functions of arrays that are exported: scores of matches, or of the features of a query and its candidates."""
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from functools import partial
 from typing import Any, Literal, NamedTuple
 
@@ -20,56 +20,26 @@ from mfvpr.utils.fields import COUNT, POSITIVE, list_of
 
 Form = Literal["vectorized", "loop"]
 
-FIELDS = {
-    "points0": ("CK2", "float32", "px"),
-    "points1": ("CK2", "float32", "px"),
-    "distance": ("CK", "float32", ""),
-    "scores0": ("CK", "float32", ""),
-    "scores1": ("CK", "float32", ""),
-    "mask": ("CK", "bool", ""),
-    "image_size0": ("2", "float32", "px"),
-    "image_size1": ("C2", "float32", "px"),
-    "ratio": ("CK", "float32", ""),
-    "confidence": ("CK", "float32", ""),
-    "index0": ("CK", "int32", ""),
-    "index1": ("CK", "int32", ""),
-    "count0": ("", "int32", ""),
-    "count1": ("C", "int32", ""),
-}
-"""Axes, type and unit of the inputs of a scorer: the fields of `Matches`, those of the query without the axis C."""
-
-_FEATURES = {
-    "keypoints": ("K2", "float32", "px"),
-    "descriptors": ("KD", "float32", ""),
-    "scores": ("K", "float32", ""),
-    "mask": ("K", "bool", ""),
-    "image_size": ("2", "float32", "px"),
-}
-FEATURES = {
-    f"{name}{side}": (first + axes, dtype, unit)
-    for side, first in (("0", ""), ("1", "C"))
-    for name, (axes, dtype, unit) in _FEATURES.items()
-}
-"""Axes, type and unit of the inputs of a system: the fields of `Features` of the query (0) and the candidates (1)."""
+# Axes, types and units of the fields of `Matches` and `Features`, without 0 and 1 and the candidates' axis C.
+_AXES = {"points": "K2", "keypoints": "K2", "descriptors": "KD", "image_size": "2", "count": ""}  # others: "K"
+_TYPES = {"mask": "bool", "index": "int32", "count": "int32"}  # others: "float32"
+_PIXELS = ("points", "keypoints", "image_size", "shift")
+_OF_QUERY = ("image_size0", "count0")  # fields of matches that all candidates share
 
 
 @dataclass(frozen=True)
 class ExportShapes:
     """Sizes of the arrays of an exported program, which are fixed; an `InputError` unless they are above 0.
 
-        mfvpr.ExportShapes(candidates=50, keypoints=800, image_size=(640, 480))
+        shapes = mfvpr.ExportShapes(candidates=50, keypoints=800, image_size=(640, 480))
 
-    Attributes:
-        candidates: C, of one query; fill up with candidates whose mask is False.
-        keypoints: K, of each image; of a scorer alone: match slots of each pair.
-        image_size: largest (width, height) of an image, px; the capacities of histograms follow from it.
-        dimension: D, of a descriptor; None = the extractor's. A scorer alone has no descriptors.
+    A scorer alone has no descriptors.
     """
 
-    candidates: int
-    keypoints: int
-    image_size: tuple[float, float]
-    dimension: int | None = None
+    candidates: int  # C, of one query; fill up with candidates whose mask is False
+    keypoints: int  # K, of each image; of a scorer alone: match slots of each pair
+    image_size: tuple[float, float]  # largest (width, height), px; the capacities of histograms follow from it
+    dimension: int | None = None  # D, of a descriptor; None = the extractor's
 
     def __post_init__(self) -> None:
         rules = {"candidates": COUNT, "keypoints": COUNT, "image_size": list_of(POSITIVE, 2), "dimension": COUNT | None}
@@ -86,13 +56,20 @@ class Tensor(NamedTuple):
     unit: str
     axes: str
 
+    @classmethod
+    def of(cls, name: str, axes: str, shapes: ExportShapes) -> "Tensor":
+        """The tensor of a name with these axes."""
+        lengths = {"C": shapes.candidates, "K": shapes.keypoints, "D": shapes.dimension or 0, "2": 2}
+        field = name.rstrip("01")
+        shape = tuple(lengths[axis] for axis in axes)
+        return cls(name, shape, _TYPES.get(field, "float32"), "px" if field in _PIXELS else "", axes)
+
 
 @dataclass(frozen=True)
 class Program:
     """A function of arrays in the order of `inputs` that returns arrays in the order of `outputs`.
 
-    `form` is how it goes over the candidates: "vectorized", as this library does, or a "loop", which converters to
-    other formats understand.
+    `form` is how it goes over the candidates: "vectorized", or a "loop", which converters to other formats understand.
     """
 
     shapes: ExportShapes
@@ -110,17 +87,18 @@ class Program:
 def make_program(
     method: Scorer | System, shapes: ExportShapes, *, with_shift: bool, with_confidence: bool = False
 ) -> Program:
-    """The program of a scorer or of a system, with the capacities that images of this size need.
+    """The program of a scorer, or of all scorers of a system, with the capacities that images of this size need.
 
-    A system returns the scores of all of its scorers, first those of the scorer that decides. An `InputError` says why
-    a method cannot be exported.
+    The scores of the scorer that decides come first. An `InputError` says why a method cannot be exported.
     """
     matcher: Any = None
-    left_out: tuple[str, ...] = ()
-    table = {name: field for name, field in FIELDS.items() if with_confidence or name != "confidence"}
-    scorers: dict[str, Scorer]
+    scorers, left_out = {"scores": method}, ()
+    names = [each.name for each in fields(Matches) if with_confidence or each.name != "confidence"]
+    table = {name: "C" * (name not in _OF_QUERY) + _AXES.get(name.rstrip("01"), "K") for name in names}
+    of_features = [each.name for each in fields(Features)]
     if isinstance(method, System):
-        table, matcher, main = FEATURES, method.pipeline.matcher, method.headline
+        matcher, main, sides = method.pipeline.matcher, method.headline, {"0": "", "1": "C"}.items()
+        table = {f"{name}{side}": first + _AXES.get(name, "K") for side, first in sides for name in of_features}
         shapes = replace(shapes, dimension=_dimension(method, shapes))
         if with_confidence:
             raise InputError("with_confidence=True: expected a scorer, got a system, whose matcher gives confidences")
@@ -130,8 +108,6 @@ def make_program(
         scorers = {"scores": method.scorers[main]}
         scorers |= {f"scores_{name}": scorer for name, scorer in method.scorers.items() if name != main}
         left_out = tuple(name for name in method.final_scores if name not in method.scorers)
-    else:
-        scorers = {"scores": method}
     for name, scorer in scorers.items():
         if on_host(scorer):
             kind, expected = type(scorer).__name__, "a scorer that JAX compiles, not on the host (score_pairs)"
@@ -154,27 +130,21 @@ def make_program(
         return tuple(values.astype(jnp.float32) for values in (*scores, *shift))
 
     def score_matches(arrays: dict[str, Array], form: Form) -> tuple[Array, ...]:
-        of_query = {name: arrays[name] for name in ("image_size0", "count0")}
+        of_query = {name: arrays[name] for name in _OF_QUERY}
         copies = {name: jnp.broadcast_to(each, (shapes.candidates, *each.shape)) for name, each in of_query.items()}
-        return _over(score, Matches(**(arrays | copies)), form)
+        matches = Matches(**(arrays | copies))
+        return _loop(score, matches) if form == "loop" else jax.vmap(score)(matches)
 
     def score_features(arrays: dict[str, Array], form: Form) -> tuple[Array, ...]:
-        query, candidates = (Features(**{name: arrays[f"{name}{side}"] for name in _FEATURES}) for side in "01")
+        query, candidates = (Features(**{name: arrays[f"{name}{side}"] for name in of_features}) for side in "01")
         match: Callable[[Features], Matches] = partial(matcher, query)
         if form == "loop":
-            return _over(lambda candidate: score(match(candidate)), candidates, form)
+            return _loop(lambda candidate: score(match(candidate)), candidates)
         return jax.vmap(score)(jax.lax.map(match, candidates))  # one similarity matrix at a time
 
-    output_table = {name: ("C", "float32", "") for name in scorers}
-    output_table |= {"shift": ("C2", "float32", "px")} if with_shift else {}
-    lengths = {"C": shapes.candidates, "K": shapes.keypoints, "D": shapes.dimension or 0, "2": 2}
-    inputs, outputs = (
-        tuple(
-            Tensor(name, tuple(lengths[axis] for axis in axes), dtype, unit, axes)
-            for name, (axes, dtype, unit) in tensors.items()
-        )
-        for tensors in (table, output_table)
-    )
+    inputs = tuple(Tensor.of(name, axes, shapes) for name, axes in table.items())
+    outputs = tuple(Tensor.of(name, "C", shapes) for name in scorers)
+    outputs += (Tensor.of("shift", "C2", shapes),) if with_shift else ()
     parts = scorers if matcher is None else {**scorers, "matcher": matcher}
     return Program(shapes, inputs, outputs, score_features if matcher else score_matches, parts, left_out)
 
@@ -192,19 +162,16 @@ def _dimension(system: System, shapes: ExportShapes) -> int:
     return known
 
 
-def _over(function: Callable[[Any], tuple[Array, ...]], pairs: Any, form: Form) -> tuple[Array, ...]:
+def _loop(function: Callable[[Any], tuple[Array, ...]], pairs: Any) -> tuple[Array, ...]:
     """`function` of every entry of the first axis."""
-    if form == "vectorized":
-        return jax.vmap(function)(pairs)
     count = len(jax.tree.leaves(pairs)[0])
 
     def entry(index: Any) -> Any:
         return jax.tree.map(lambda leaf: jax.lax.dynamic_index_in_dim(leaf, index, keepdims=False), pairs)
 
     def step(index: Any, outputs: tuple[Array, ...]) -> tuple[Array, ...]:
-        values = function(entry(index))
-        update = jax.lax.dynamic_update_index_in_dim
-        return tuple(update(output, each, index, 0) for output, each in zip(outputs, values, strict=True))
+        parts = zip(outputs, function(entry(index)), strict=True)
+        return tuple(jax.lax.dynamic_update_index_in_dim(output, each, index, 0) for output, each in parts)
 
     shapes = jax.eval_shape(lambda: function(entry(0)))
     return jax.lax.fori_loop(0, count, step, tuple(jnp.zeros((count, *each.shape), each.dtype) for each in shapes))

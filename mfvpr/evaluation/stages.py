@@ -32,10 +32,19 @@ from mfvpr.core.types import Array, Matches, Shortlist
 from mfvpr.core.weights import match_weights
 from mfvpr.evaluation.rankings import Scores, fuse_scales
 from mfvpr.features.feature_set import memory_budget
-from mfvpr.matchers import batched_matching as batched
 from mfvpr.matchers import host_matcher as host
 from mfvpr.matchers.host_matcher import PairSource, Side
-from mfvpr.matchers.match_set import MatchSet, QueryMatches, Scales, batches, partition, queries_that_fit, scales
+from mfvpr.matchers.match_set import (
+    QUERIES,
+    MatchSet,
+    QueryMatches,
+    Scales,
+    batches,
+    match_queries,
+    partition,
+    queries_that_fit,
+    scales,
+)
 from mfvpr.matchers.matcher import NEIGHBORS, Matcher
 from mfvpr.storage.cache_files import MatchStore
 from mfvpr.utils.errors import InputError
@@ -186,7 +195,7 @@ def match(
         memory, devices = runtime.memory or WORKER_MEMORY, None
     shared = queries, database, candidates, matcher, memory, devices
     if store is None:
-        results = runtime.map(_match_queries, shared, range(len(queries)), "matching", batched.QUERIES)
+        results = runtime.map(_match_queries, shared, range(len(queries)), "matching", QUERIES)
         matched = [query for _, query in results]
         counts = np.array([query.counts for query in matched], np.int32).reshape(candidates.indices.shape)
         return MatchSet.of([query.matches for query in matched], counts)
@@ -195,7 +204,7 @@ def match(
         row for row, query in enumerate(stored) if query is None or not np.array_equal(query.indices, indices[row])
     ]
     if missing:
-        results = runtime.map(_match_queries, shared, missing, "matching", batched.QUERIES)
+        results = runtime.map(_match_queries, shared, missing, "matching", QUERIES)
         together = 1 if is_on_host else STORE_BATCH  # on the host, a query may take minutes
         while batch := dict(itertools.islice(results, together)):
             store.write(batch)
@@ -217,7 +226,7 @@ def _match_queries(
     if isinstance(matcher, PairSource):
         return host.match_queries(queries, database, candidates, rows, matcher)
     devices = devices or [device_of(())]
-    return batched.match_queries(queries, database, candidates, rows, matcher, memory=memory, devices=devices)
+    return match_queries(queries, database, candidates, rows, matcher, memory=memory, devices=devices)
 
 
 def stored_matches(store: MatchStore, *, memory: float | None = None) -> tuple[MatchSet, Shortlist] | None:

@@ -1,7 +1,7 @@
 """Images -> keypoints, descriptors and global descriptors.
 
 Read first: extractor (the protocols, and folders of images), sift (the shortest extractor), network (what extractors
-with a network share; global descriptors), then keypoint_networks, patch_networks, ssm_features with whitening; vlad
+with a network share; global descriptors; keypoints), then patch_networks, ssm_features with whitening; vlad
 (global descriptors from local ones), feature_set (features on demand).
 """
 

@@ -24,8 +24,7 @@ __all__ = [
 
 from .extractor import Aggregated, Description, Extractor, Scale, Source
 from .feature_set import FeatureSet, FeatureSource, InMemory
-from .keypoint_networks import AlikedFeatures, D2NetFeatures
-from .network import GlobalDescriptor, MixVprDescriptor
+from .network import AlikedFeatures, D2NetFeatures, GlobalDescriptor, MixVprDescriptor
 from .patch_networks import Dinov2Features, PatchNetVladFeatures, SelaVprFeatures
 from .sift import Sift
 from .ssm_features import SsmCells, SsmWindows

@@ -28,14 +28,10 @@ class Scale(NamedTuple):
 
 
 class Description(NamedTuple):
-    """Global descriptor and local features of one image, as NumPy arrays.
+    """Global descriptor and local features of one image, as NumPy arrays."""
 
-    vector: global descriptor of unit length, or several; None = no global descriptor.
-    local: Features by scale, without padding (mask all True); () = no local features.
-    """
-
-    vector: Float[np.ndarray, " dimensions"] | Float[np.ndarray, "vectors dimensions"] | None = None
-    local: tuple[Features, ...] = ()
+    vector: Float[np.ndarray, " dimensions"] | Float[np.ndarray, "vectors dimensions"] | None = None  # unit length
+    local: tuple[Features, ...] = ()  # by scale, without padding (mask all True)
 
     @property
     def features(self) -> Features:
@@ -113,7 +109,7 @@ class Source(Protocol):
 
 @dataclass(frozen=True)
 class Aggregated:
-    """Global descriptors that are aggregated from local features, by a vocabulary that is fitted to the database."""
+    """Global descriptors aggregated from local features, by a vocabulary that is fitted to the database."""
 
     extractor: Extractor | Source
     fitting: VladFitting

@@ -1,7 +1,7 @@
-"""Sources of local features, and the features that are on a device at the moment.
+"""Sources of local features (a store, a file of another program, a list), and the features that are on a device.
 
-A data set's features need not fit into memory. They stay in their source (a store, a file of another program, a list);
-only their counts are always known. Rows are read when they are matched, and stay on the device until it is full.
+A data set's features need not fit into memory: only their counts are always known. Rows are read when they are matched,
+and stay on the device until it is full.
 """
 
 import itertools
@@ -47,33 +47,22 @@ class InMemory:
         self.counts = np.array([len(images[row].mask) if row in images else -1 for row in range(total)], int)
 
     def read(self, rows: Iterable[int] | None = None) -> Iterator[tuple[int, Features]]:
-        """See `FeatureSource`."""
         return ((row, self._images[row]) for row in (sorted(self._images) if rows is None else rows))
 
 
 @dataclass(frozen=True)
 class FeatureSet:
-    """Local features of all images of a folder, of one scale.
-
-    Attributes:
-        source: where the features are.
-        bad: images without usable features or without a usable global descriptor: row -> reason.
-    """
+    """Local features of all images of a folder, of one scale."""
 
     source: FeatureSource
-    bad: Mapping[int, str]
+    bad: Mapping[int, str]  # images without usable features or without a usable global descriptor: row -> reason
 
     @classmethod
     def of(cls, images: Sequence[Features], *, unit_length: bool = True) -> "FeatureSet":
-        """Make a set from your own features, one `[N_i, ...]` per image; padding is dropped.
+        """Make a set from your own features, one `[N_i, ...]` per image, at least one; padding is dropped.
 
-        Args:
-            images: at least one.
-            unit_length: whether descriptors must be of unit length, as the weight 2 - distance requires. Matching looks
-                for the largest dot product, and takes descriptors of any length.
-
-        Raises:
-            InputError: no images, arrays of wrong shapes, or descriptors that are not of unit length.
+        Descriptors must be of `unit_length`, as the weight 2 - distance requires; matching itself looks for the largest
+        dot product, and takes any. No images, other lengths, and arrays of wrong shapes raise an `InputError`.
         """
         if not images:
             raise InputError("FeatureSet.of: expected the features of at least one image, got none")
@@ -98,19 +87,14 @@ class FeatureSet:
         return features
 
     @cached_property
-    def _example(self) -> Features:
-        """The first image that has keypoints."""
-        return self[int(np.argmax(self.counts > 0))]
+    def dimension(self) -> int:
+        """Length of a descriptor, of the first image that has keypoints."""
+        return self[int(np.argmax(self.counts > 0))].descriptors.shape[1]
 
     @property
     def keypoint_bytes(self) -> int:
-        """Bytes of one keypoint with its descriptor, score and mask."""
-        return sum(values[:1].nbytes for values in per_keypoint(self._example).values())
-
-    @property
-    def dimension(self) -> int:
-        """Length of a descriptor."""
-        return self._example.descriptors.shape[1]
+        """Bytes of one keypoint with its descriptor, position and score, float32, and mask."""
+        return 4 * (self.dimension + 3) + 1
 
     def read(self, rows: Iterable[int]) -> Iterator[tuple[int, Features]]:
         """Read (row, Features `[n, ...]`) of the images in `rows` that have keypoints."""
@@ -119,13 +103,9 @@ class FeatureSet:
 
 
 def memory_budget(memory: float | None, devices: Sequence[Device]) -> int:
-    """Bytes for features on each device: `memory` GB, by default a third of the free memory.
-
-    Devices without memory of their own share the host's.
-    """
-    free = free_bytes(devices[0])
-    sharing = 1 if devices[0].memory_stats() else len(devices)
-    return int((SHARE * free if memory is None else 1e9 * memory) / sharing)
+    """Bytes for features on each device: `memory` GB, by default a third of the free memory."""
+    sharing = 1 if devices[0].memory_stats() else len(devices)  # devices without memory share the host's
+    return int((SHARE * free_bytes(devices[0]) if memory is None else 1e9 * memory) / sharing)
 
 
 class Staged(NamedTuple):
@@ -140,8 +120,8 @@ class Staged(NamedTuple):
 class Slots:
     """Rows of a feature set on one device, padded, in slots of a few capacities; the least recently used makes room.
 
-    An image's capacity depends on its count and on the counts of all `wanted` images, never on the images that it is
-    matched with. `stage` reads rows, and may run ahead on another thread by two calls; `put` writes them to the device.
+    An image's capacity depends on its count and those of all `wanted` images, never on the images that it is matched
+    with. `stage` reads rows, and may run ahead on another thread by two calls; `put` writes them to the device.
     """
 
     def __init__(self, features: FeatureSet, wanted: Int[np.ndarray, " rows"], budget: int, device: Device) -> None:
@@ -243,10 +223,8 @@ def check_features(image: Features, name: str, *, unit_length: bool) -> None:
         return
     lengths = np.linalg.norm(np.asarray(image.descriptors, np.float32)[image.mask], axis=1)
     if (wrong := np.abs(lengths - 1) > 0.01).any():
-        raise InputError(
-            f"{name}: expected descriptors of unit length, got {lengths[wrong][0]:.4g}; "
-            "divide them by their Euclidean length, or say unit_length=False"
-        )
+        got = f"{lengths[wrong][0]:.4g}; divide them by their Euclidean length, or say unit_length=False"
+        raise InputError(f"{name}: expected descriptors of unit length, got {got}")
 
 
 def pad_rows(
@@ -263,9 +241,7 @@ def pad_rows(
     return arrays, np.arange(capacity) < counts[:, None]
 
 
-def few_capacities(
-    counts: Int[np.ndarray, "..."], quantiles: Sequence[float], step: int
-) -> Int[np.ndarray, " capacities"]:
+def few_capacities(counts: Int[np.ndarray, "..."], quantiles: Sequence[float], step: int) -> Int[np.ndarray, " _"]:
     """Few capacities, ascending multiples of `step`, that hold rows of lengths `counts`: quantiles of those above 0."""
     lengths = counts[counts > 0]
     if not lengths.size:

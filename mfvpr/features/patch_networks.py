@@ -1,7 +1,7 @@
 """Global descriptors with a local feature for every patch of an image, of one pass of a network.
 
-DINOv2 (Oquab et al., TMLR 2024), as tokens or, as in EffoVPR, values of the attention; SelaVPR (Lu et al., ICLR 2024);
-Patch-NetVLAD (Hausler et al., CVPR 2021). Keypoints are the middles of the patches, in row order.
+DINOv2 (Oquab et al., TMLR 2024); SelaVPR (Lu et al., ICLR 2024); Patch-NetVLAD (Hausler et al., CVPR 2021). Keypoints
+are the middles of the patches, in row order.
 """
 
 from dataclasses import dataclass
@@ -45,15 +45,11 @@ class Dinov2Features(NetworkExtractor):
     network = VisionTransformer
     image_size: tuple[int, int] = setting((336, 336), SIZE, "width, height, multiples of 14")
     facet: Facet = setting(
-        "token",
-        word_of(Facet),
-        "token: the normalized tokens after the block; query, key, value: parts of its attention, with all heads",
+        "token", word_of(Facet), "token: normalized, after the block; query, key, value of its attention, all heads"
     )
     block: int = setting(-1, whole(-24, 23), "from the last, -1, backward; or from the first, 0, forward")
     threshold: float = setting(
-        0.0,
-        number(0, 1),
-        "keep patches with at least this share of the class token's largest attention to a patch; 0 = all",
+        0.0, number(0, 1), "keep patches with at least this share of the class token's largest attention; 0 = all"
     )
 
     def __post_init__(self) -> None:
@@ -63,15 +59,10 @@ class Dinov2Features(NetworkExtractor):
             raise InputError(f"block={self.block}: expected from {-depth} to {depth - 1}, a block of this network")
 
     @property
-    def vector_size(self) -> int:
-        """Length of the class token."""
-        return self.model.width
-
-    @property
     def scales(self) -> tuple[Scale, ...]:
         """One scale with all patches, also if `threshold` drops some."""
         width, height = self.image_size
-        return (Scale(self.model.width, (width // PATCH) * (height // PATCH)),)
+        return (Scale(self.model.dimension, (width // PATCH) * (height // PATCH)),)
 
     def compute(self, model: VisionTransformer, images: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
         """Global descriptors `[B, D]`, local descriptors `[B, rows, columns, D]` and scores `[B, rows, columns]`."""
@@ -132,15 +123,10 @@ class PatchNetVladFeatures(NetworkExtractor):
     network = VggNetVlad
     image_size: tuple[int, int] = setting((640, 480), SIZE, "width, height")
     patch_sizes: tuple[int, ...] = setting(
-        (5,),
-        list_of(whole(1, 64)),
-        "positions of the map, 16 px each; of several, each is a scale, scored by itself",
+        (5,), list_of(whole(1, 64)), "positions of the map, 16 px each; of several, each is a scale, scored by itself"
     )
     scale_weights: tuple[float, ...] | None = setting(
-        None,
-        list_of(POSITIVE) | None,
-        "of the scales' scores, each standardized over a query's candidates; null = 1 each",
-        recipe=False,
+        None, list_of(POSITIVE) | None, "of the scales' standardized scores; null = 1 each", recipe=False
     )
 
     def __post_init__(self) -> None:
@@ -165,8 +151,7 @@ class PatchNetVladFeatures(NetworkExtractor):
 
     @property
     def _map_size(self) -> tuple[int, int]:
-        width, height = self.image_size
-        return width // STRIDE, height // STRIDE
+        return self.image_size[0] // STRIDE, self.image_size[1] // STRIDE
 
     def compute(self, model: VggNetVlad, images: jax.Array) -> Any:
         return model.with_patches(model.preprocess(images), self.patch_sizes)

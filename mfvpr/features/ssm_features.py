@@ -7,28 +7,20 @@ from functools import cached_property
 from typing import Any, ClassVar, Literal
 
 import jax
-import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float, Num
+from jaxtyping import Float
 
 from mfvpr.core.types import Array
 from mfvpr.features.extractor import Description, Scale, local_features
 from mfvpr.features.network import NetworkExtractor, compile_network, only_size
 from mfvpr.features.whitening import Whitening, WindowFitting, Windows, kernels, learned_whitening
 from mfvpr.networks.backbones import STAGE1_STRIDE, STAGE2_STRIDE, SsmVgg
-from mfvpr.networks.layers import PRECISION, Preprocessing
+from mfvpr.networks.layers import PRECISION, Preprocessing, of_unit_length
 from mfvpr.utils.fields import SIZE, setting, whole, word_of
 
 _CHANNELS = 512
-_STRIDES = {1: STAGE1_STRIDE, 2: STAGE2_STRIDE}
-_FITTINGS = {1: WindowFitting(125), 2: WindowFitting(100, dtype="float64")}  # as published
+_OF_WINDOWS, _OF_CELLS = WindowFitting(125), WindowFitting(100, dtype="float64")  # as published
 _MIDDLE = (STAGE2_STRIDE - 1) / 2  # px from a position's first pixel to its middle
-
-
-def normalize_maps(maps: Float[Array, "*batch channels"]) -> Float[Array, "*batch channels"]:
-    """Scale maps to unit length at every position; zero stays zero."""
-    length = jnp.sqrt(jnp.sum(maps * maps, axis=-1, keepdims=True))
-    return maps / jnp.where(length > 0, length, 1.0)
 
 
 def whiten_windows(
@@ -39,11 +31,8 @@ def whiten_windows(
     stride: int,
 ) -> Float[Array, "images windows dimensions"]:
     """Descriptors of all windows of maps."""
-    axes = ("NHWC", "HWIO", "NHWC")
-    strides = (stride, stride)
-    descriptors = jax.lax.conv_general_dilated(
-        maps, kernel, strides, "VALID", dimension_numbers=axes, precision=PRECISION
-    )
+    layout = {"dimension_numbers": ("NHWC", "HWIO", "NHWC"), "precision": PRECISION}
+    descriptors = jax.lax.conv_general_dilated(maps, kernel, (stride, stride), "VALID", **layout)
     return descriptors.reshape(len(maps), -1, descriptors.shape[-1]) - offset[None, None]
 
 
@@ -57,38 +46,29 @@ class SsmMaps(NetworkExtractor):
     @property
     def shape(self) -> tuple[int, int, int]:
         """(rows, columns, channels) of a map."""
-        columns, rows = (-(-side // _STRIDES[self.stage]) for side in self.image_size)
+        stride = {1: STAGE1_STRIDE, 2: STAGE2_STRIDE}[self.stage]
+        columns, rows = (-(-side // stride) for side in self.image_size)
         return rows, columns, _CHANNELS
 
     @property
     def vector_size(self) -> int:
         return math.prod(self.shape)
 
-    def compute(
-        self, model: SsmVgg, images: Num[Array, "images height width 3"]
-    ) -> Float[Array, "images rows columns 512"]:
-        """Maps of a batch; runs in a compiled program."""
-        return normalize_maps(model(model.preprocess(images, self.preprocessing), self.stage))
+    def compute(self, model: SsmVgg, images: Array) -> Float[Array, "images rows columns 512"]:
+        return of_unit_length(model(model.preprocess(images, self.preprocessing), self.stage))
 
 
 @dataclass(frozen=True)
 class _WhitenedWindows(NetworkExtractor):
-    """Base of the extractors of whitened windows of a stage's maps.
-
-    `whitening` are settings to learn it from the database, or the learned whitening.
-    """
+    """Base of the extractors of whitened windows; `whitening` has settings to learn it from the database, or is it."""
 
     stage: ClassVar[Literal[1, 2]]
 
     preprocessing: Preprocessing = setting(
         "torch", word_of(Preprocessing), "torch, as published, or caffe, which the weights are for"
     )
-    whitening: WindowFitting | Whitening = _FITTINGS[1]
-
-    @property
-    def windows(self) -> Windows:
-        """The windows of a map."""
-        raise NotImplementedError
+    whitening: WindowFitting | Whitening = _OF_WINDOWS
+    windows: ClassVar[Any]  # the Windows of a map, a property
 
     @property
     def maps(self) -> SsmMaps:
@@ -111,18 +91,13 @@ class _WhitenedWindows(NetworkExtractor):
 
 @dataclass(frozen=True)
 class SsmWindows(_WhitenedWindows):
-    """Descriptors for retrieval by votes: 36 whitened windows of 9 x 9 positions of the first stage's map.
-
-    Images have 224 x 224 px, because the map of a larger image has more windows and the public code draws 36.
-    """
+    """Descriptors for retrieval by votes: 36 whitened windows of 9 x 9 positions of the first stage's map."""
 
     stage = 1
     image_size: tuple[int, int] = only_size(224, 224)
-    whitening: WindowFitting | Whitening = _FITTINGS[1]
 
     @property
     def windows(self) -> Windows:
-        """The 36 windows of a map."""
         return Windows(self.maps.shape, 9)
 
     @property
@@ -146,7 +121,7 @@ class SsmCells(_WhitenedWindows):
     image_size: tuple[int, int] = setting(
         (336, 336), SIZE, "width, height: 40 x 40 cells; [224, 224]: 26 x 26, [448, 448]: 54 x 54"
     )
-    whitening: WindowFitting | Whitening = _FITTINGS[2]
+    whitening: WindowFitting | Whitening = _OF_CELLS
     stride: int = setting(1, whole(1, 8), "positions of the map, 8 px each, from cell to cell")
 
     def __post_init__(self) -> None:
@@ -160,7 +135,6 @@ class SsmCells(_WhitenedWindows):
 
     @property
     def scales(self) -> tuple[Scale, ...]:
-        """One scale with all cells."""
         return (Scale(self.whitening.dimension, self.windows.count),)
 
     def describe_result(self, result: Float[np.ndarray, "cells dimensions"]) -> Description:

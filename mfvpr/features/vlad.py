@@ -27,22 +27,17 @@ _CHUNK = 2**23  # numbers of an array at a time: few large products, which do no
 class VladFitting:
     """Settings of a vocabulary, the centers of a mixture of round Gaussians of equal size, from a few steps of EM.
 
-    This is k-means with soft memberships, so that a change of the last bit of a descriptor hardly changes the words.
-
-    Attributes:
-        num_words: of the vocabulary.
-        power: exponent of the power law.
-        max_samples: largest number of descriptors to learn from.
-        seed: of the random images, and of the start: a normal sample with the descriptors' mean and covariance.
+    This is k-means with soft memberships, so that a change of the last bit of a descriptor hardly changes the words. It
+    starts at a normal sample with the descriptors' mean and covariance.
 
     Raises:
         InputError: `max_samples` is less than `num_words`.
     """
 
     num_words: int = setting(64, whole(1, 4096))
-    power: float = setting(0.5, POSITIVE)
-    max_samples: int = setting(100_000, COUNT)
-    seed: int = setting(0, INDEX)
+    power: float = setting(0.5, POSITIVE)  # exponent of the power law
+    max_samples: int = setting(100_000, COUNT)  # descriptors to learn from
+    seed: int = setting(0, INDEX)  # of the random images and of the start
 
     def __post_init__(self) -> None:
         check_fields(self)

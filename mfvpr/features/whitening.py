@@ -5,16 +5,16 @@ from windows of the database's images, see `mfvpr.retrieval.fit_to_database`. It
 are one convolution of the map, and only the fitting forms windows.
 """
 
+import itertools
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import suppress
 from dataclasses import dataclass
-from typing import Literal, Protocol, runtime_checkable
+from typing import Any, Literal
 
 import numpy as np
 import scipy  # its subpackages are imported at their first use
 from jaxtyping import Float, Int
 
-from mfvpr.features.extractor import Extractor
 from mfvpr.utils.errors import InputError
 from mfvpr.utils.fields import COUNT, FLAG, INDEX, check_fields, setting, whole
 from mfvpr.utils.fingerprints import fingerprint, recipe_of
@@ -34,7 +34,6 @@ class Whitening:
 
     @property
     def dimension(self) -> int:
-        """Number of components."""
         return len(self.components)
 
 
@@ -111,7 +110,6 @@ class Windows:
 
     @property
     def count(self) -> int:
-        """Number of windows of a map."""
         return self.grid[0] * self.grid[1]
 
     @property
@@ -124,10 +122,8 @@ class Windows:
         """(row, column) of each window's first position."""
         return self.stride * np.stack(np.divmod(np.arange(self.count), self.grid[1]), axis=1)
 
-    def take(
-        self, image_map: Float[np.ndarray, "rows columns channels"], numbers: Int[np.ndarray, " windows"]
-    ) -> Float[np.ndarray, "windows dimensions"]:
-        """The windows `numbers` of one map."""
+    def take(self, image_map: np.ndarray, numbers: Int[np.ndarray, " windows"]) -> Float[np.ndarray, "windows _"]:
+        """The windows `numbers` of one map `[rows, columns, channels]`."""
         parts = [image_map[row : row + self.size, column : column + self.size] for row, column in self.corners[numbers]]
         return np.reshape(parts, (len(numbers), self.dimension))
 
@@ -164,38 +160,21 @@ class WindowFitting:
 
         Unreadable images may be missing. Too few windows raise an `InputError`.
         """
-        total = len(rows) * windows.count
-        chosen = np.arange(total)
-        if self.max_windows is not None and total > self.max_windows:
+        chosen = np.arange(len(rows) * windows.count)
+        if self.max_windows is not None and len(chosen) > self.max_windows:
             rng = np.random.default_rng([self.seed, 1])
-            chosen = np.sort(rng.choice(total, self.max_windows, replace=False))
-        count = len(chosen) + self.zero_row
-        sample, filled = np.zeros((count, windows.dimension), self.dtype), 0
-        starts = {row: windows.count * number for number, row in enumerate(rows)}
-        for batch in maps:
-            for row, image_map in batch.items():
-                first, end = np.searchsorted(chosen, [starts[row], starts[row] + windows.count])
-                sample[filled : filled + end - first] = windows.take(image_map, chosen[first:end] - starts[row])
-                filled += end - first
+            chosen = np.sort(rng.choice(len(chosen), self.max_windows, replace=False))
+        place, number = np.divmod(chosen, windows.count)
+        sample, filled = np.zeros((len(chosen) + self.zero_row, windows.dimension), self.dtype), 0
+        for row, image_map in itertools.chain.from_iterable(batch.items() for batch in maps):
+            numbers = number[place == rows.index(row)]
+            sample[filled : filled + len(numbers)] = windows.take(image_map, numbers)
+            filled += len(numbers)
         return fit_whitening(sample[: filled + self.zero_row], self.dimension)
 
 
-@runtime_checkable
-class WindowExtractor(Protocol):
-    """An extractor of whitened windows of `maps`: a dataclass whose `whitening` is replaced when it was learned."""
-
-    @property
-    def whitening(self) -> WindowFitting | Whitening: ...
-
-    @property
-    def windows(self) -> Windows: ...
-
-    @property
-    def maps(self) -> Extractor: ...
-
-
-def learned_whitening(extractor: WindowExtractor) -> Whitening:
-    """The extractor's learned whitening; an `InputError` if it was not learned yet, or from something else."""
+def learned_whitening(extractor: Any) -> Whitening:
+    """Learned whitening of an extractor; an `InputError` if it was not learned yet, or from something else."""
     name, whitening, expected = type(extractor).__name__, extractor.whitening, extractor.windows.dimension
     if not isinstance(whitening, Whitening):
         raise InputError(f"{name}: has not seen the database; take mfvpr.retrieval.fit_to_database(...) of it")
@@ -206,17 +185,15 @@ def learned_whitening(extractor: WindowExtractor) -> Whitening:
     return whitening
 
 
-def origin(extractor: WindowExtractor) -> str:
+def origin(extractor: Any) -> str:
     """Hash of the network, its preprocessing and the windows; "" if they have no recipe."""
     with suppress(TypeError):
         return fingerprint(recipe_of([extractor.maps, extractor.windows]))
     return ""
 
 
-def kernels(
-    whitening: Whitening, windows: Windows
-) -> tuple[Float[np.ndarray, "size size channels dimensions"], Float[np.ndarray, " dimensions"]]:
-    """The whitening as a convolution of a map: a kernel and an offset, float32."""
+def kernels(whitening: Whitening, windows: Windows) -> tuple[np.ndarray, np.ndarray]:
+    """The whitening as a convolution of a map: a kernel `[size, size, channels, D']` and an offset `[D']`, float32."""
     components = whitening.components.reshape(-1, windows.size, windows.size, windows.shape[2])
     offset = whitening.components.astype(np.float64) @ whitening.mean
     return np.moveaxis(components, 0, -1).astype(np.float32), offset.astype(np.float32)

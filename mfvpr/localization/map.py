@@ -320,7 +320,7 @@ class Map:
             for entry, count, strength_sum in self._file.entries(before):
                 if len(self) == len(self._vectors):
                     more = np.zeros((max(_FIRST_ROWS, len(self)), len(entry.vector)), np.float32)
-                    self._vectors = np.concatenate([self._vectors, more]) if len(self) else more
+                    self._vectors = np.concatenate([self._vectors.reshape(-1, len(entry.vector)), more])
                 self._vectors[len(self)] = entry.vector if entry.vector.any() else np.nan
                 self._row_of_name[entry.name] = len(self)
                 self._images.append((entry.name, entry.place))

@@ -1,7 +1,7 @@
 """Matchers as values, and matches of many queries with their candidates.
 
-Read first: matcher (nearest neighbors, LightGlue, soft matching), host_matcher; then batched_matching (shortlists) and
-match_set (matches of many queries).
+Read first: matcher (nearest neighbors, LightGlue, soft matching), host_matcher; then match_set (matches of
+shortlists, and of many queries).
 """
 
 import lazy_loader

@@ -15,8 +15,7 @@ from mfvpr.datasets.image_reading import Interpolation, resize
 from mfvpr.features.feature_set import FeatureSet
 from mfvpr.io.containers import shorten
 from mfvpr.io.matches import numbered_matches, point_matches
-from mfvpr.matchers.batched_matching import Pair, join_candidates
-from mfvpr.matchers.match_set import QueryMatches
+from mfvpr.matchers.match_set import Pair, QueryMatches, join_candidates
 from mfvpr.utils.errors import InputError
 from mfvpr.utils.fields import COUNT, check_fields, list_of, setting, word_of
 from mfvpr.utils.numerics import as_array
@@ -26,12 +25,9 @@ Side = ImageFolder | FeatureSet  # the images, or the features of the images, of
 
 
 class HostPairs(Protocol):
-    """Matches of queries with database images.
+    """Matches of queries with database images."""
 
-    numbered: whether matches have the numbers of keypoints (`index0`, `index1`, `count0`, `count1`).
-    """
-
-    numbered: bool
+    numbered: bool  # whether matches have the numbers of keypoints (`index0`, `index1`, `count0`, `count1`)
 
     def read(self, query: int, candidates: Sequence[int]) -> Sequence[Matches | None]:
         """Matches `[n]` of a query with each candidate, NumPy, without padding, with confidences; None = no matches."""
@@ -47,12 +43,10 @@ class PairSource(Protocol):
     """Finds matches on the host, a query at a time."""
 
     @property
-    def inputs(self) -> Inputs:
-        """Content of the sides: folders of images, or sets of their features."""
-        ...
+    def inputs(self) -> Inputs: ...
 
     def open(self, queries: Any, database: Any) -> HostPairs:
-        """Pairs of the two sides."""
+        """Pairs of the two sides, folders of images or sets of their features as `inputs` says."""
         ...
 
 
@@ -70,12 +64,11 @@ class HostMatcher:
 
     - of two images: points `[M, 2]` of both, (x, y) px of these images, and optionally confidences `[M]` from 0 to 1;
       or a mapping with `matched_kpts0`, `matched_kpts1` and optionally `matched_confidences`, as vismatch returns it;
-    - of two Features (NumPy, without padding): numbers of keypoints `[M]` of both, and optionally confidences `[M]`.
+    - of two Features (NumPy, without padding): numbers of keypoints `[M]`, and optionally confidences `[M]`.
 
     Attributes:
         function: of the query and the candidate.
-        name: of the program, its version and weights. A cache reuses the matches of a name; it does not compare the
-            code of the function.
+        name: of the program, its version and weights, by which a cache knows the matches, not by the function's code.
         inputs: what the function takes; with images, the extractor of a pipeline is used only for retrieval.
         image_size: (width, height) that images are resized to, px; None = their own size.
         interpolation: of the resizing.
@@ -102,14 +95,11 @@ class HostMatcher:
             raise InputError(f"image_size={self.image_size}: expected None with inputs='features'")
 
     def open(self, queries: Side, database: Side) -> "_CalledPairs":
-        """See `PairSource`."""
         return _CalledPairs(self, queries, database)
 
 
 @dataclass(frozen=True)
 class _CalledPairs:
-    """Pairs that a function matches."""
-
     matcher: HostMatcher
     queries: Any
     database: Any
@@ -124,8 +114,10 @@ class _CalledPairs:
     def read(self, query: int, candidates: Sequence[int]) -> list[Matches | None]:
         first, (function, size) = self._input(self.queries, query), (self.matcher.function, self.matcher.batch_size)
         matches: dict[int, Matches | None] = dict.fromkeys(candidates)
+        if first is None:
+            return [None for _ in candidates]
         copy = partial(jax.tree.map, np.array)  # the function may change its arguments
-        for start in range(0, len(candidates) if first is not None else 0, size or 1):
+        for start in range(0, len(candidates), size or 1):
             inputs = {row: self._input(self.database, row) for row in candidates[start : start + (size or 1)]}
             inputs = {row: second for row, second in inputs.items() if second is not None}
             if size is None:

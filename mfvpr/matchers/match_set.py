@@ -1,20 +1,26 @@
-"""Matches of many queries with their candidates: ragged sets, and padded batches of pairs for scoring."""
+"""Shortlists -> matches of all pairs, in batches of queries on all devices; ragged sets; padded batches for scoring."""
 
 import itertools
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections import deque
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, partial
+from typing import Any, NamedTuple
 
+import jax
 import numpy as np
 from jaxtyping import Float, Int, Num
 
-from mfvpr.core.types import Matches, per_match, per_pair
-from mfvpr.features.feature_set import few_capacities, pad_rows
+from mfvpr.core.types import Features, Matches, Shortlist, per_match, per_pair
+from mfvpr.features.feature_set import FeatureSet, Slots, Staged, few_capacities, memory_budget, pad_rows
+from mfvpr.matchers.matcher import Matcher, match_pairs
 from mfvpr.utils.fingerprints import content_hash
-from mfvpr.utils.numerics import available_cpus, repeat_last, round_up
+from mfvpr.utils.numerics import Device, available_cpus, holds_function, repeat_last, round_up
 from mfvpr.utils.runtime import ordered_map
 
+QUERIES = 8  # per batch; the queries of a batch share the features of their candidates
+PAIRS = 128  # per call
 BATCH_SLOTS = 2**14  # slots of a batch of pairs: its votes stay in the cache
 PAIRS_STEP = 8
 SLOTS_STEP = 32
@@ -24,17 +30,14 @@ BYTES_PER_SLOT = 41
 BLOCK_BYTES = 2**28
 
 Row = Mapping[str, np.ndarray]  # matches [n, ...] by field
+Calls = list[tuple[Int[np.ndarray, " pairs"], Matches]]  # (positions in the pairs of a part, their matches)
 
 
 @dataclass(frozen=True)
 class QueryMatches:
-    """Candidates of one query, best first, and their n real matches one after the other. NumPy.
+    """Candidates of one query, best first, and their n real matches one after the other. NumPy."""
 
-    In the matches, `image_size0` `[2]` and `count0` `[]` are the query's, `image_size1` `[C, 2]` and `count1` `[C]` the
-    candidates'.
-    """
-
-    matches: Matches
+    matches: Matches  # image_size0 [2] and count0 [] are the query's, image_size1 [C, 2] and count1 [C] the candidates'
     counts: Int[np.ndarray, " candidates"]  # matches of each candidate, int32; their sum is n
     indices: Int[np.ndarray, " candidates"]  # database rows, int32, -1 = none
     filter_scores: Float[np.ndarray, " candidates"]  # float32
@@ -42,17 +45,11 @@ class QueryMatches:
 
 @dataclass(frozen=True)
 class MatchSet:
-    """Matches of every query with its candidates, of one scale, without padding.
+    """Matches of every query with its candidates, of one scale, without padding."""
 
-    Attributes:
-        matches: per query, as in QueryMatches; a store may read them on access.
-        counts: matches of each candidate.
-        capacity: slots that suffice for every pair.
-    """
-
-    matches: Sequence[Matches]
-    counts: Int[np.ndarray, "queries candidates"]
-    capacity: int
+    matches: Sequence[Matches]  # per query, as in QueryMatches; a store may read them on access
+    counts: Int[np.ndarray, "queries candidates"]  # matches of each candidate
+    capacity: int  # slots that suffice for every pair
 
     @classmethod
     def of(cls, matches: Sequence[Matches], counts: Int[np.ndarray, "queries candidates"]) -> "MatchSet":
@@ -61,7 +58,8 @@ class MatchSet:
 
     def __getitem__(self, query: int) -> Matches:
         """Matches `[C, K, ...]` of one query, padded with zeros to the capacity."""
-        return self.pairs(np.full(self.counts.shape[1], query), np.arange(self.counts.shape[1]), self.capacity)
+        places = np.arange(self.counts.shape[1])
+        return self.pairs(np.full_like(places, query), places, self.capacity)
 
     def __len__(self) -> int:
         return len(self.matches)
@@ -71,24 +69,17 @@ class MatchSet:
         matches = ordered_map(self.matches.__getitem__, list(queries), workers=available_cpus())
         return MatchSet(list(matches), self.counts[queries], self.capacity)
 
-    def pairs(
-        self,
-        queries: Int[np.ndarray, " pairs"],
-        places: Int[np.ndarray, " pairs"],
-        capacity: int,
-        *,
-        total: int | None = None,
-    ) -> Matches:
+    def pairs(self, queries: np.ndarray, places: np.ndarray, capacity: int, *, total: int | None = None) -> Matches:
         """Matches `[P, K, ...]` of pairs, padded with zeros to K = `capacity` slots, for `places` in the shortlists.
 
         There are `total` pairs with padding, which has no matches, and the images of the last pair.
         """
         by_query = {query: self.matches[query] for query in np.unique(queries).tolist()}
         pairs = list(zip(queries.tolist(), places.tolist(), strict=True))
+        ends = {query: np.cumsum(self.counts[query]) for query in by_query}
         rows = []
         for query, place in pairs:  # views
-            end = self._ends[query, place]
-            part = slice(end - self.counts[query, place], end)
+            part = slice(ends[query][place] - self.counts[query, place], ends[query][place])
             rows.append({name: values[part] for name, values in per_match(by_query[query]).items()})
         entries, mask = pad_rows(rows, capacity, total=total)
         for name in per_pair(by_query[pairs[0][0]]):
@@ -104,34 +95,22 @@ class MatchSet:
         return content_hash(self.counts, [content_hash(query) for query in self.matches])
 
     @cached_property
-    def _ends(self) -> Int[np.ndarray, "queries candidates"]:
-        """End of each candidate's matches among the matches of its query."""
-        return np.cumsum(self.counts, axis=1)
-
-    @cached_property
     def image_sizes(self) -> tuple[Num[np.ndarray, "pairs 2"], Num[np.ndarray, "pairs 2"]]:
         """Sizes of query and database images, in all combinations."""
-        sizes = ([query.image_size0, query.image_size1] for query in self.matches)
-        sizes0, sizes1 = (
-            np.unique(np.concatenate([np.reshape(size, (-1, 2)) for size in side]), axis=0)
-            for side in zip(*sizes, strict=True)
-        )
+        sizes = [[np.reshape(size, (-1, 2)) for size in (each.image_size0, each.image_size1)] for each in self.matches]
+        sizes0, sizes1 = (np.unique(np.concatenate(side), axis=0) for side in zip(*sizes, strict=True))
         return np.repeat(sizes0, len(sizes1), 0), np.tile(sizes1, (len(sizes0), 1))
 
 
 @dataclass(frozen=True)
 class Scales:
-    """Matches of every pair at several scales, such as patch sizes: one match set per scale.
+    """Matches of every pair at several scales, such as patch sizes.
 
     Functions that score a MatchSet accept Scales, too, and fuse the scores of the scales, see `fuse_scales`.
-
-    Attributes:
-        match_sets: S match sets of the same queries and candidates.
-        weights: of the scales; None = 1 each.
     """
 
-    match_sets: Sequence[MatchSet]
-    weights: Sequence[float] | None = None
+    match_sets: Sequence[MatchSet]  # one per scale, of the same queries and candidates
+    weights: Sequence[float] | None = None  # of the scales; None = 1 each
 
     @property
     def image_sizes(self) -> tuple[Num[np.ndarray, "pairs 2"], Num[np.ndarray, "pairs 2"]]:
@@ -165,9 +144,9 @@ def shapes(match_set: MatchSet, *, settings: float = math.inf) -> dict[int, int]
 def partition(
     match_set: MatchSet, queries: range, *, settings: float = math.inf
 ) -> list[tuple[Int[np.ndarray, " _"], int, int]]:
-    """Batches of all pairs of some queries that have matches; the first of each shape comes first.
+    """Batches of all pairs with matches: positions in the flattened `[queries, candidates]`, slots, pairs with padding.
 
-    A batch has positions of pairs in the flattened `[queries, candidates]`, slots of a pair, and pairs with padding.
+    The first batch of each shape comes first.
     """
     part = slice(queries.start, queries.stop)
     counts = match_set.counts[part].reshape(-1)
@@ -215,9 +194,7 @@ def split_rows(flat: Row, counts: Int[np.ndarray, " rows"]) -> list[dict[str, np
     ]
 
 
-def prune_capacities(
-    capacities: Int[np.ndarray, " capacities"], counts: Int[np.ndarray, "..."], saving: float
-) -> Int[np.ndarray, " _"]:
+def prune_capacities(capacities: np.ndarray, counts: Int[np.ndarray, "..."], saving: float) -> Int[np.ndarray, " _"]:
     """The largest of ascending `capacities`, and each that saves at least `saving` slots of padding."""
     lengths = counts[counts > 0]
     while len(capacities) > 1:
@@ -227,3 +204,134 @@ def prune_capacities(
             break
         capacities = np.delete(capacities, saved.argmin())
     return capacities
+
+
+class Part(NamedTuple):
+    """Pairs of a batch of queries with candidates that fit on the device at the same time."""
+
+    pairs: Int[np.ndarray, "pairs 3"]  # row of the query, position of the candidate in its shortlist, database row
+    device: Device
+    ends: Int[np.ndarray, " queries"]  # rows of the queries without further pairs
+
+
+class Pair(NamedTuple):
+    """Real matches of one pair, and the sizes of its images."""
+
+    matches: Row
+    image_size0: Num[np.ndarray, "2"]
+    image_size1: Num[np.ndarray, "2"]
+
+
+Sides = tuple[Slots, Slots]  # features of queries and of the database on one device
+
+
+def match_queries(
+    queries: FeatureSet,
+    database: FeatureSet,
+    candidates: Shortlist,
+    todo: Sequence[int],
+    matcher: Matcher,
+    *,
+    memory: float | None,
+    devices: Sequence[Device],
+) -> Iterator[tuple[int, QueryMatches]]:
+    """Match queries with their candidates: (row, matches) in the order of `todo`, NumPy.
+
+    A thread reads features while the devices work. `memory` is `mfvpr.Runtime.memory`.
+    """
+    indices, scores = np.asarray(candidates.indices), np.asarray(candidates.scores)
+    counts0, counts1, rows = queries.counts, database.counts, np.asarray(todo, int)
+    match = partial(match_pairs, matcher=matcher)
+    if holds_function(matcher):  # or it would be compiled for every call; the program goes with the last query
+        match = jax.jit(match)
+    database_rows, budget = np.unique(indices), memory_budget(memory, devices)
+    database_rows = database_rows[database_rows >= 0]
+    sides = {
+        device: (Slots(queries, np.arange(len(queries)), 0, device), Slots(database, database_rows, budget, device))
+        for device in devices
+    }
+
+    def stage(part: Part) -> tuple[Part, list[Staged]]:
+        """Read the features that are not on the device."""
+        return part, [slots.stage(part.pairs[:, side]) for slots, side in zip(sides[part.device], (0, 2), strict=True)]
+
+    no_matches = _no_matches(queries, database, matcher)
+    pairs: dict[tuple[int, int], Pair] = {}  # by (query, place), until the last pair of the query
+    begun: deque[tuple[Part, Calls]] = deque()
+    parts = _parts(counts0, counts1, indices, rows, sides)
+    for step in itertools.chain(ordered_map(stage, parts, workers=1), [None]):
+        if step is not None:
+            begun.append((step[0], _begin(sides[step[0].device], step[1], match)))
+        while len(begun) > (0 if step is None else len(devices)):
+            part, calls = begun.popleft()
+            for positions, padded in calls:
+                count = len(positions)
+                real = jax.tree.map(lambda values, count=count: np.asarray(values)[:count], padded)
+                places = map(tuple, part.pairs[positions, :2].tolist())
+                of_call = map(Pair, split_pairs(real), real.image_size0, real.image_size1)
+                pairs.update(zip(places, of_call, strict=True))
+            for query in part.ends.tolist():
+                of_query = [pairs.pop((query, place), None) for place in range(indices.shape[1])]
+                keypoints = np.where(indices[query] >= 0, counts1[indices[query]], 0).astype(np.int32)
+                matches, counts = join_candidates(of_query, no_matches, counts0[query].astype(np.int32), keypoints)
+                yield query, QueryMatches(matches, counts, indices[query], scores[query])
+
+
+def _parts(
+    counts0: np.ndarray, counts1: np.ndarray, indices: np.ndarray, todo: np.ndarray, sides: dict[Device, Sides]
+) -> Iterator[Part]:
+    """Parts of all batches, each batch on the next device; without pairs that lack keypoints."""
+    for start, device in zip(range(0, len(todo), QUERIES), itertools.cycle(sides), strict=False):
+        batch = todo[start : start + QUERIES]
+        rows = indices[batch]
+        number, place = np.nonzero((rows >= 0) & (counts1[rows] > 0) & (counts0[batch] > 0)[:, None])
+        pairs = np.stack([batch[number], place, rows[number, place]], axis=1)
+        groups = list(sides[device][1].parts(np.unique(pairs[:, 2])))  # database rows that fit at the same time
+        for group in groups[:-1]:
+            yield Part(pairs[np.isin(pairs[:, 2], group)], device, batch[:0])
+        yield Part(pairs[np.isin(pairs[:, 2], groups[-1:])], device, batch)
+
+
+def _begin(sides: Sides, staged: Sequence[Staged], match: Callable[..., Matches]) -> Calls:
+    """Start matching a part on the device, a call per `PAIRS` pairs of the same capacities."""
+    arrays = [slots.put(rows) for slots, rows in zip(sides, staged, strict=True)]
+    capacities, slots = (np.stack([getattr(side, name) for side in staged], axis=1) for name in ("capacity", "slot"))
+    calls = []
+    for shape in np.unique(capacities, axis=0):
+        members = np.flatnonzero((capacities == shape).all(axis=1))
+        features = [of_side[int(capacity)] for of_side, capacity in zip(arrays, shape, strict=True)]
+        for start in range(0, len(members), PAIRS):
+            positions = members[start : start + PAIRS]
+            pairs = repeat_last(slots[positions], PAIRS)
+            calls.append((positions, match(*features, pairs, np.int32(len(positions)))))
+    return calls
+
+
+def join_candidates(
+    pairs: Sequence[Pair | None], no_matches: Row, count0: Any, count1: Int[np.ndarray, " candidates"] | None
+) -> tuple[Matches, Int[np.ndarray, " candidates"]]:
+    """Matches of all candidates, one after the other, and their numbers; images without a pair have 1 x 1 px."""
+    missing = Pair(no_matches, np.ones(2, np.float32), np.ones(2, np.float32))
+    real = [pair for pair in pairs if pair is not None] or [missing]
+    rows = {name: np.concatenate([pair.matches[name] for pair in real]) for name in real[0].matches}
+    pairs = [pair or missing for pair in pairs]
+    matches = Matches(
+        **rows,
+        mask=np.ones(len(rows["points0"]), bool),
+        image_size0=real[0].image_size0,
+        image_size1=np.array([pair.image_size1 for pair in pairs]).reshape(-1, 2),
+        count0=count0,
+        count1=count1,
+    )
+    return matches, np.array([len(pair.matches["points0"]) for pair in pairs], np.int32)
+
+
+def _no_matches(queries: FeatureSet, database: FeatureSet, matcher: Matcher) -> Row:
+    """Empty row with the fields that the matcher returns."""
+    dimensions = [side.dimension for side in (queries, database) if (side.counts > 0).any()]
+    dimension = dimensions[0] if dimensions else getattr(matcher, "dimension", 1)
+    shapes = {"keypoints": (1, 2), "descriptors": (1, dimension), "scores": (1,), "image_size": (2,)}
+    arrays = {name: np.ones(shape, np.float32) for name, shape in shapes.items()}
+    image = Features(**arrays, mask=np.ones(1, bool))
+    fields = per_match(jax.eval_shape(matcher, image, image))
+    return {name: np.zeros((0, *leaf.shape[1:]), leaf.dtype) for name, leaf in fields.items()}

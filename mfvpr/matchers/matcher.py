@@ -23,14 +23,13 @@ from mfvpr.core.matching import (
 )
 from mfvpr.core.nearest import CrossCheck, Product, Query, largest_of, lines_of, products, ready
 from mfvpr.core.types import Array, Features, Matches, short_repr, value
-from mfvpr.networks.lightglue_assignment import Packed, assignment
 from mfvpr.utils.errors import InputError, require_word
 from mfvpr.utils.fields import COUNT, check_fields, number, setting, word_of
 from mfvpr.utils.fingerprints import fingerprint, recipe_of
 from mfvpr.utils.numerics import as_array, as_float, compiled, is_concrete, masked, positive, safe_sqrt
 
 if TYPE_CHECKING:  # Flax takes half a second
-    from mfvpr.networks.lightglue import LightGlue
+    from mfvpr.networks.lightglue import LightGlue, Packed
 
 CHUNK_SIZE = "pairs matched at once; null = 1 on a CPU, elsewhere what a small part of its memory holds"
 
@@ -44,14 +43,13 @@ class Matcher(Protocol):
         pipeline = mfvpr.Pipeline(extractor, retriever, matcher=near)
 
     It must work under `jit` and `vmap`: slots depend on shapes alone, and the content of padding has no effect, NaN
-    included. A matcher is a value (`mfvpr.value`); its arrays, such as the weights of a network, are fields. A cache
-    on disk needs a `recipe`, see `mfvpr.utils.recipe_of`. An optional field `chunk_size` is the number of pairs that
-    are matched at the same time; without it, or if None, memory decides, assuming one similarity matrix per pair.
+    included. A matcher is a value (`mfvpr.value`), its arrays are fields. A cache on disk needs a `recipe`, see
+    `mfvpr.utils.recipe_of`. An optional field `chunk_size` is the number of pairs that are matched at the same time;
+    without it, or if None, memory decides, assuming one similarity matrix per pair.
 
-    An optional method `prepare(queries, candidates, chunk_size)` does once per query what would be done for each of its
-    pairs. It takes Features `[B, N0]` and `[S, N1]`, and returns what the matcher then takes in place of a query's
-    Features: arrays with the leading axis B. A matcher must take plain Features as well, with which other functions
-    call it, as `NearestNeighborMatcher` does.
+    An optional method `prepare(queries, candidates, chunk_size)` does the work per query once. It takes Features
+    `[B, N0]` and `[S, N1]`, and returns arrays with the leading axis B. The matcher must take both these arrays and
+    plain Features in place of a query's, as `NearestNeighborMatcher` does.
     """
 
     def __call__(self, features0: Features, features1: Features, /) -> Matches: ...
@@ -63,8 +61,7 @@ class NearestNeighborMatcher:
 
         matcher = mfvpr.NearestNeighborMatcher(cross_check="mutual", max_distance=0.7, max_matches=500)
 
-    `chunk_size` and `product` are those of `match_candidates`; they change only time, memory, and
-    which of two neighbors is taken whose products differ by less than the rounding of float32.
+    `chunk_size` and `product` are those of `match_candidates`: they change time, memory, and ties within rounding.
     """
 
     cross_check: CrossCheck = setting(
@@ -83,7 +80,6 @@ class NearestNeighborMatcher:
             require_word("product", self.product, Product)
 
     def prepare(self, queries: Features, candidates: Features, chunk_size: int) -> Query:
-        """The queries `[B, N0]` in the form that matching needs."""
         options = candidates, self.cross_check, chunk_size, self.product
         return jax.vmap(lambda query: prepare_query(query, *options))(queries)
 
@@ -104,17 +100,15 @@ class LightGlueMatcher:
     `mfvpr.match`. The published weights are for ALIKED's features of 128 dimensions, and useless for other features.
 
     Attributes:
-        weights: of the network.
         network: recipe of the network that the weights belong to.
         filter_threshold: a match is kept if its assignment is larger.
-        depth_confidence: skip the remaining layers of a pair once more than this share of its keypoints is confident.
-            This loses matches, a third on photographs; None = never. The pairs of a chunk wait for the slowest. The
-            public code uses 0.95 by default and also prunes keypoints, which this class does not: matches equal those
-            of `width_confidence=-1`.
-        chunk_size: pairs at a time, see `mfvpr.Matcher`; changes only memory, time and the last bits.
+        depth_confidence: skip the remaining layers of a pair once more than this share of its keypoints is confident,
+            which loses a third of the matches on photographs; None = never. The public code uses 0.95 by default, and
+            prunes keypoints: matches equal those of its `width_confidence=-1`.
+        chunk_size: see `mfvpr.Matcher`; changes only memory, time and the last bits.
     """
 
-    weights: Packed
+    weights: "Packed"
     network: str = field(metadata={"static": True})
     filter_threshold: float = setting(
         0.1, number(0, 1), "matches are kept whose assignment, their confidence, is above it"
@@ -136,7 +130,6 @@ class LightGlueMatcher:
 
     @property
     def dimension(self) -> int:
-        """Dimension of the descriptors."""
         return self.weights.input.kernel.shape[0]
 
     @property
@@ -145,10 +138,9 @@ class LightGlueMatcher:
         return {name: getattr(self, name) for name in ("network", "filter_threshold", "depth_confidence")}
 
     def __call__(self, features0: Features, features1: Features) -> Matches:
-        """Matches of one pair, keypoints `[N0, 2]` and `[N1, 2]`: max(N0, 1) slots, slot k is keypoint k of the query.
+        """Matches of one pair: max(N0, 1) slots, slot k is keypoint k; an `InputError` for another `dimension`."""
+        from mfvpr.networks.lightglue import assignment
 
-        Descriptors of another dimension raise an `InputError`.
-        """
         features0, features1 = (ready(at_least_one(features)) for features in (features0, features1))
         for features in (features0, features1):
             if (got := features.descriptors.shape[-1]) != self.dimension:
@@ -168,10 +160,9 @@ def soft_match(features0: Features, features1: Features, *, temperature: float |
 
         matches = mfvpr.soft_match(features0, features1, temperature=0.1)
 
-    See Rocco et al., NeurIPS 2018. Let R be the softmax of s / T over the candidate's keypoints j, and C the softmax
-    over the query's keypoints i. Slot i holds the means of points, scores and squared distances 2 - 2 s_ij under R,
-    with confidence sum_j R_ij C_ij. For T -> 0 this is `match`: the nearest neighbor, with confidence 1 if it is
-    mutual, else 0.
+    See Rocco et al., NeurIPS 2018. Let R and C be the softmax of s / T over the candidate's keypoints j and over the
+    query's keypoints i. Slot i holds the means of points, scores and squared distances 2 - 2 s_ij under R, with
+    confidence sum_j R_ij C_ij. For T -> 0 this is `match`, with confidence 1 if the neighbor is mutual, else 0.
 
     Args:
         features0: query, keypoints `[N0, 2]`; padding may hold anything.

@@ -15,8 +15,7 @@ from flax import nnx
 from jaxtyping import Bool, Float, Int
 
 from mfvpr.core.types import Array
-from mfvpr.networks.layers import EPSILON, PRECISION, BatchNorm, Images, bias_of, conv, matmul, of_unit_length
-from mfvpr.networks.sampling import Neighbors, around, between, neighbors, sample, stretch
+from mfvpr.networks import layers
 
 STRIDE = 32  # px, of the coarsest map
 RADIUS = 2  # px, of the suppression, the refinement and the border without keypoints
@@ -37,7 +36,7 @@ class DeformableConv(nnx.Module):
 
     def __init__(self, inputs: int, outputs: int, *, rngs: nnx.Rngs) -> None:
         self.kernel = nnx.Param(nnx.initializers.lecun_normal()(rngs.params(), (3, 3, inputs, outputs)))
-        self.offset = conv(inputs, 18, use_bias=True, rngs=rngs)
+        self.offset = layers.conv(inputs, 18, use_bias=True, rngs=rngs)
 
     def __call__(self, x: Float[Array, "batch height width inputs"]) -> Float[Array, "batch height width outputs"]:
         """Convolve a map; taps move by a quarter of the longer side at most.
@@ -53,7 +52,7 @@ class DeformableConv(nnx.Module):
 
         def add(total: Array, tap: tuple[Array, Array]) -> tuple[Array, None]:
             points, kernel = tap
-            return total + matmul(over_batch(sample)(x, points), kernel), None
+            return total + layers.matmul(over_batch(layers.sample)(x, points), kernel), None
 
         kernels = self.kernel[...].reshape(9, inputs, -1)
         total = jnp.zeros((*x.shape[:3], kernels.shape[-1]), x.dtype)
@@ -64,10 +63,10 @@ class Block(nnx.Module):
     """Two 3 x 3 convolutions with batch normalization and SELU; an optional shortcut before the last SELU."""
 
     def __init__(self, inputs: int, outputs: int, *, deformable: bool, shortcut: bool, rngs: nnx.Rngs) -> None:
-        convolution = DeformableConv if deformable else conv
+        convolution = DeformableConv if deformable else layers.conv
         self.conv1, self.conv2 = (convolution(width, outputs, rngs=rngs) for width in (inputs, outputs))
-        self.bn1, self.bn2 = (BatchNorm(outputs, rngs=rngs) for _ in range(2))
-        self.shortcut = conv(inputs, outputs, 1, use_bias=True, rngs=rngs) if shortcut else None
+        self.bn1, self.bn2 = (layers.BatchNorm(outputs, rngs=rngs) for _ in range(2))
+        self.shortcut = layers.conv(inputs, outputs, 1, use_bias=True, rngs=rngs) if shortcut else None
 
     def __call__(self, x: Float[Array, "batch height width inputs"]) -> Float[Array, "batch height width outputs"]:
         out = self.bn2(self.conv2(nnx.selu(self.bn1(self.conv1(x)))))
@@ -85,30 +84,27 @@ class Aliked(nnx.Module):
         inputs = 3
         for place, width in enumerate(widths, start=1):
             setattr(self, f"block{place}", Block(inputs, width, deformable=place > 2, shortcut=place > 1, rngs=rngs))
-            setattr(self, f"conv{place}", conv(width, self.dimension // 4, 1, rngs=rngs))
+            setattr(self, f"conv{place}", layers.conv(width, self.dimension // 4, 1, rngs=rngs))
             inputs = width
         steps = ((self.dimension, 8, 1), (8, 4, 3), (4, 4, 3), (4, 1, 3))
-        self.score_head = nnx.List([conv(*step, rngs=rngs) for step in steps])
+        self.score_head = nnx.List([layers.conv(*step, rngs=rngs) for step in steps])
         self.desc_head = DescriptorHead(self.dimension, positions, rngs=rngs)
 
-    def extract(
-        self, images: Images, threshold: Array | float, capacity: int
-    ) -> tuple["Detections", Float[Array, "batch slots dimensions"]]:
-        """Keypoints of RGB images, 0 .. 1, and their descriptors of unit length."""
+    def extract(self, images: layers.Images, threshold: Array | float, capacity: int) -> layers.Detections:
+        """Keypoints of RGB images, 0 .. 1, with their descriptors; each field has a leading axis `batch`."""
         levels, scores = self.levels(images)
 
-        def extract_one(levels: list[Array], scores: Array) -> tuple[Detections, Array]:
-            detections = detect(scores, threshold, capacity)
-            return detections, self.desc_head(field(levels, *_inside(images)), detections.keypoints, detections.count)
+        def extract_one(levels: list[Array], scores: Array) -> layers.Detections:
+            detections, features = detect(scores, threshold, capacity), field(levels, *_inside(images))
+            descriptors = self.desc_head(features, detections.keypoints, detections.count)
+            return detections._replace(descriptors=descriptors)
 
         return over_batch(extract_one)(levels, scores)
 
-    def levels(
-        self, images: Images
-    ) -> tuple[list[Float[Array, "batch _ _ channels"]], Float[Array, "batch height width"]]:
-        """Parts of the features at each resolution of the padded images, and scores in (0, 1) of all pixels.
+    def levels(self, images: layers.Images) -> tuple[list[Array], Float[Array, "batch height width"]]:
+        """Parts of the features `[B, h, w, C]` at each resolution, and scores in (0, 1) of all pixels.
 
-        Border pixels are repeated to make the sides multiples of 32.
+        Border pixels are repeated to make the sides multiples of 32. The parts are those of the padded images.
         """
         rows, columns = _inside(images)
         height, width = (-(-size // STRIDE) * STRIDE for size in images.shape[1:3])
@@ -120,19 +116,14 @@ class Aliked(nnx.Module):
             x = x.reshape(batch, height // factor, factor, width // factor, factor, channels).mean(axis=(2, 4))
             x = getattr(self, f"block{place}")(x)
             levels.append(nnx.selu(getattr(self, f"conv{place}")(x)))
-        return levels, self._scores(levels)[:, rows, columns]
-
-    def _scores(self, levels: list[Array]) -> Float[Array, "batch height width"]:
-        """Scores of the padded images."""
         # The first convolution (1 x 1) and the enlargement are linear: it runs first, so that 8 channels are enlarged.
         first, *convolutions = self.score_head
-        parts = jnp.split(first.kernel[0, 0], len(levels))
-        total = jnp.zeros((), levels[0].dtype)
-        for level, part in zip(levels, parts, strict=True):
-            total += stretch(matmul(level, part), *levels[0].shape[1:3])
+        scores = jnp.zeros((), levels[0].dtype)
+        for level, part in zip(levels, jnp.split(first.kernel[0, 0], len(levels)), strict=True):
+            scores += layers.stretch(layers.matmul(level, part), *levels[0].shape[1:3])
         for convolution in convolutions:
-            total = _narrow(convolution, nnx.selu(total))
-        return nnx.sigmoid(total[..., 0])
+            scores = _narrow(convolution, nnx.selu(scores))
+        return levels, nnx.sigmoid(scores[:, rows, columns, 0])
 
 
 def _narrow(convolution: nnx.Conv, x: Array) -> Array:
@@ -145,11 +136,11 @@ def _narrow(convolution: nnx.Conv, x: Array) -> Array:
     group, source, target = np.indices((3, _PIXELS, _PIXELS))
     column = (group - 1) * _PIXELS + source - target + 1  # of the kernel, from pixel `source` of a group to `target`
     selection = (column[..., None] == np.arange(3)).astype(np.float32)
-    kernel = jnp.einsum("bstx,yxio->ybsito", selection, convolution.kernel[...], precision=PRECISION)
+    kernel = jnp.einsum("bstx,yxio->ybsito", selection, convolution.kernel[...], precision=layers.PRECISION)
     kernel = kernel.reshape(3, 3, _PIXELS * inputs, -1)
     x = x.reshape(batch, height, width // _PIXELS, _PIXELS * inputs)
     axes = ("NHWC", "HWIO", "NHWC")
-    out = jax.lax.conv_general_dilated(x, kernel, (1, 1), "SAME", dimension_numbers=axes, precision=PRECISION)
+    out = jax.lax.conv_general_dilated(x, kernel, (1, 1), "SAME", dimension_numbers=axes, precision=layers.PRECISION)
     return out.reshape(batch, height, width, -1)
 
 
@@ -164,7 +155,7 @@ class Level(NamedTuple):
     """One map of a field, already enlarged in height; `columns` enlarge it in width."""
 
     rows: Float[Array, "height _ channels"]
-    columns: Neighbors | None  # None if the rows have full width
+    columns: layers.Neighbors | None  # None if the rows have full width
 
 
 class Field(NamedTuple):
@@ -186,12 +177,10 @@ class Field(NamedTuple):
 
     def sample(self, points: Float[Array, "points 2"]) -> Float[Array, "points dimensions"]:
         """Features at positions (x, y) px, bilinear; 0 outside."""
-        corners = [self._weighted_parts(*corner) for corner in around(points, *self.inverse_norm.shape)]
+        corners = [self._weighted_parts(*corner) for corner in layers.around(points, *self.inverse_norm.shape)]
         return jnp.concatenate([sum(parts[1:], start=parts[0]) for parts in zip(*corners, strict=True)], axis=-1)
 
-    def _weighted_parts(
-        self, y: Int[Array, " pixels"], x: Int[Array, " pixels"], weight: Float[Array, " pixels"]
-    ) -> list[Float[Array, "pixels _"]]:
+    def _weighted_parts(self, y: Array, x: Array, weight: Array) -> list[Float[Array, "pixels _"]]:
         """Parts of each level for the features of pixels inside the image, times `weight`."""
         # Sums of separate parts are several times faster than sums of concatenated features.
         weight *= _rows_at(self.inverse_norm.reshape(-1), y * self.inverse_norm.shape[1] + x)
@@ -212,11 +201,11 @@ def field(levels: Sequence[Float[Array, "_ _ channels"]], rows: slice, columns: 
     height, width = levels[0].shape[:2]
     parts = [Level(levels[0][rows, columns], None)]
     for level in levels[1:]:
-        down, right = neighbors(level.shape[0], height, rows), neighbors(level.shape[1], width, columns)
-        parts.append(Level(between(level, down, -3), right))
-    wide = [part.rows if part.columns is None else between(part.rows, part.columns, -2) for part in parts]
+        down, right = layers.neighbors(level.shape[0], height, rows), layers.neighbors(level.shape[1], width, columns)
+        parts.append(Level(layers.between(level, down, -3), right))
+    wide = [part.rows if part.columns is None else layers.between(part.rows, part.columns, -2) for part in parts]
     squares = [jnp.sum(part * part, axis=-1) for part in wide]
-    return Field(tuple(parts), 1 / jnp.maximum(jnp.sqrt(sum(squares[1:], start=squares[0])), EPSILON))
+    return Field(tuple(parts), 1 / jnp.maximum(jnp.sqrt(sum(squares[1:], start=squares[0])), layers.EPSILON))
 
 
 def _rows_at(rows: Array, places: Array) -> Array:
@@ -228,9 +217,9 @@ class DescriptorHead(nnx.Module):
 
     def __init__(self, dimension: int, positions: int, *, rngs: nnx.Rngs) -> None:
         moves = 2 * positions
-        self.offset1 = conv(dimension, moves, use_bias=True, rngs=rngs)
-        self.offset2 = conv(moves, moves, 1, use_bias=True, rngs=rngs)
-        self.sample = conv(dimension, dimension, 1, rngs=rngs)
+        self.offset1 = layers.conv(dimension, moves, use_bias=True, rngs=rngs)
+        self.offset2 = layers.conv(moves, moves, 1, use_bias=True, rngs=rngs)
+        self.sample = layers.conv(dimension, dimension, 1, rngs=rngs)
         initial = nnx.initializers.lecun_normal()
         self.agg_weights = nnx.Param(initial(rngs.params(), (positions, dimension, dimension)))
 
@@ -253,17 +242,17 @@ class DescriptorHead(nnx.Module):
         start = jnp.zeros((len(keypoints), dimension), keypoints.dtype)
         return jax.lax.fori_loop(0, chunks, describe, start)[:slots]
 
-    def _describe(self, features: Field, keypoints: Float[Array, "slots 2"]) -> Float[Array, "slots dimensions"]:
+    def _describe(self, features: Field, keypoints: Array) -> Float[Array, "slots dimensions"]:
         """Descriptors of all keypoints, place by place, so that intermediate values stay in the CPU's caches."""
 
         def add(total: Array, place: tuple[Array, Array]) -> tuple[Array, None]:
             move, mixing = place
-            sampled = nnx.selu(matmul(features.sample(keypoints + move), self.sample.kernel[0, 0]))
-            return total + matmul(sampled, mixing), None
+            sampled = nnx.selu(layers.matmul(features.sample(keypoints + move), self.sample.kernel[0, 0]))
+            return total + layers.matmul(sampled, mixing), None
 
         start = jnp.zeros((len(keypoints), self.agg_weights.shape[-1]), keypoints.dtype)
         descriptors, _ = jax.lax.scan(add, start, (self._moves(features, keypoints), self.agg_weights[...]))
-        return of_unit_length(descriptors)
+        return layers.of_unit_length(descriptors)
 
     def _moves(self, features: Field, keypoints: Float[Array, "slots 2"]) -> Float[Array, "positions slots 2"]:
         """Offsets (x, y) px of the places, a quarter of the longer side at most.
@@ -277,30 +266,21 @@ class DescriptorHead(nnx.Module):
 
         def add(total: Array, neighbor: tuple[Array, Array]) -> tuple[Array, None]:
             step, kernel = neighbor
-            return total + matmul(features.at(row + step[0], column + step[1]), kernel), None
+            return total + layers.matmul(features.at(row + step[0], column + step[1]), kernel), None
 
         kernels = self.offset1.kernel[...].reshape(9, -1, self.offset1.out_features)
         hidden, _ = jax.lax.scan(add, jnp.zeros((len(keypoints), kernels.shape[-1]), keypoints.dtype), (steps, kernels))
-        hidden = nnx.selu(hidden + bias_of(self.offset1)[None])
-        moves = matmul(hidden, self.offset2.kernel[0, 0]) + bias_of(self.offset2)[None]
+        hidden = nnx.selu(hidden + layers.bias_of(self.offset1)[None])
+        moves = layers.matmul(hidden, self.offset2.kernel[0, 0]) + layers.bias_of(self.offset2)[None]
         limit = max(features.inverse_norm.shape) / 4
         return jnp.clip(moves, -limit, limit).reshape(len(keypoints), 2, -1).transpose(2, 0, 1)
 
 
-class Detections(NamedTuple):
-    """Keypoints of one image, ordered by row, or by score if there are more than slots."""
-
-    keypoints: Float[Array, "slots 2"]  # (x, y) px
-    scores: Float[Array, " slots"]
-    mask: Bool[Array, " slots"]  # True on the first ones
-    count: Int[Array, ""]  # number of peaks; if above the slots, those with the lowest scores are missing
-
-
-def detect(score_map: Float[Array, "height width"], threshold: Array | float, capacity: int) -> Detections:
+def detect(score_map: Float[Array, "height width"], threshold: Array | float, capacity: int) -> layers.Detections:
     """Peaks of a map above `threshold`, refined to fractions of a pixel, in min(capacity, height * width) slots.
 
-    If no peak is above it, or `threshold` is 0, the map's mean is the threshold. (The original takes the mean if the
-    whole batch has no peak.)
+    They are ordered by row, or by score if there are more than slots. If no peak is above it, or `threshold` is 0, the
+    map's mean is the threshold. (The original takes the mean if the whole batch has no peak.)
     """
     width = score_map.shape[1]
     scores, peaks = score_map.reshape(-1), _peaks(score_map).reshape(-1)
@@ -311,7 +291,7 @@ def detect(score_map: Float[Array, "height width"], threshold: Array | float, ca
     row_order = -jnp.arange(valid.size, dtype=scores.dtype)
     key, place = jax.lax.top_k(jnp.where(valid, jnp.where(count > capacity, scores, row_order), -jnp.inf), capacity)
     keypoints = _refine(score_map, place // width, place % width)
-    return Detections(keypoints, sample(score_map[..., None], keypoints)[..., 0], key > -jnp.inf, count)
+    return layers.Detections(keypoints, layers.sample(score_map[..., None], keypoints)[..., 0], key > -jnp.inf, count)
 
 
 def _peaks(scores: Float[Array, "height width"]) -> Bool[Array, "height width"]:
@@ -326,7 +306,7 @@ def _peaks(scores: Float[Array, "height width"]) -> Bool[Array, "height width"]:
 
 
 def _local_maximum(values: Array) -> Array:
-    """Maximum around each pixel. Slices along each axis are faster than a window reduction."""
+    """Maximum layers.around each pixel. Slices along each axis are faster than a window reduction."""
     lowest = False if values.dtype == bool else -jnp.inf
     for axis, size in enumerate(values.shape):
         margin = [(0, 0), (0, 0)]
@@ -337,10 +317,8 @@ def _local_maximum(values: Array) -> Array:
     return values
 
 
-def _refine(
-    score_map: Float[Array, "height width"], row: Int[Array, " slots"], column: Int[Array, " slots"]
-) -> Float[Array, "slots 2"]:
-    """Mean position (x, y) px around each peak, weighted by a softmax of the scores."""
+def _refine(score_map: Array, row: Array, column: Array) -> Float[Array, "slots 2"]:
+    """Mean position (x, y) px layers.around each peak, weighted by a softmax of the scores."""
     height, width = score_map.shape
     reach = jnp.arange(2 * RADIUS + 1)
     padded = jnp.pad(score_map, RADIUS)

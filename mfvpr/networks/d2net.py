@@ -17,9 +17,8 @@ from jax import lax
 from jaxtyping import Bool, Float, Int
 
 from mfvpr.core.types import Array
+from mfvpr.networks import layers
 from mfvpr.networks.backbones import Vgg16
-from mfvpr.networks.layers import Images, Pixels, Preprocessing, of_unit_length, preprocess
-from mfvpr.networks.sampling import sample, stretch
 
 STRIDE = 4  # px between positions of the map
 SCALES = (0.5, 1.0, 2.0)  # of the multi-scale detection, in this order
@@ -36,15 +35,15 @@ class D2Net(nnx.Module):
     def __init__(self, *, rngs: nnx.Rngs) -> None:
         self.vgg = Vgg16("conv4_3", pools=("max", "max", "average"), dilations=(1, 1, 1, 2), rngs=rngs)
 
-    def __call__(self, images: Images) -> Float[Array, "batch height//4-1 width//4-1 512"]:
+    def __call__(self, images: layers.Images) -> Float[Array, "batch height//4-1 width//4-1 512"]:
         """Dense maps of preprocessed images."""
         return nnx.relu(self.vgg(images, uniform=_repeats(images)))
 
 
-def _repeats(images: Images) -> Bool[Array, ""]:
+def _repeats(images: layers.Images) -> Bool[Array, ""]:
     """Whether two neighbors in a map of any image have equal receptive fields, as in a white sky.
 
-    The map is constant there, but rounding can create peaks. Pixels outside the images count as equal.
+    The map is constant there, but rounding can create peaks. layers.Pixels outside the images count as equal.
     """
     batch, height, width, _ = images.shape
     rows, columns = -(-height // STRIDE), -(-width // STRIDE)
@@ -63,16 +62,6 @@ def _repeats(images: Images) -> Bool[Array, ""]:
     return repeats
 
 
-class Detections(NamedTuple):
-    """Keypoints of one map, ordered by channel, then row, then column; padding is last."""
-
-    keypoints: Float[Array, "slots 2"]  # (x, y), px of the map's image
-    descriptors: Float[Array, "slots channels"]  # unit Euclidean length
-    scores: Float[Array, " slots"]  # the map's value at the integer position
-    mask: Bool[Array, " slots"]
-    count: Int[Array, ""]  # number of keypoints; if above the slots, those with the lowest scores are missing
-
-
 class Survey(NamedTuple):
     """Properties of each position of a map, in its strongest channel."""
 
@@ -89,13 +78,13 @@ def map_size(pixels: int) -> int:
 
 def extract(
     model: D2Net,
-    images: Pixels,
+    images: layers.Pixels,
     *,
-    preprocessing: Preprocessing = "caffe",
+    preprocessing: layers.Preprocessing = "caffe",
     scales: Sequence[float] = (1.0,),
     share: float = 1.0,
-) -> tuple[Detections, ...]:
-    """Keypoints of images: one Detections per scale, each with a leading axis `batch`.
+) -> tuple[layers.Detections, ...]:
+    """Keypoints of images: one layers.Detections per scale, each with a leading axis `batch`.
 
     Args:
         images: RGB, 0 .. 255, at least 12 px high and wide at every scale.
@@ -103,10 +92,10 @@ def extract(
         scales: of the images, see `detect`; `SCALES` are the original's.
         share: slots per position of a map; 1 has room for all keypoints.
     """
-    pixels = preprocess(images, preprocessing)
+    pixels = layers.preprocess(images, preprocessing)
     height, width = images.shape[1:3]
     sizes = [(int(height * scale), int(width * scale)) for scale in scales]
-    maps = [model(stretch(pixels, rows, columns)) for rows, columns in sizes]
+    maps = [model(layers.stretch(pixels, rows, columns)) for rows, columns in sizes]
     ratios = [(width / columns, height / rows) for rows, columns in sizes]
     return jax.vmap(lambda levels: detect(levels, ratios, share))(maps)
 
@@ -115,19 +104,19 @@ def detect(
     maps: Sequence[Float[Array, "_ _ channels"]],
     ratios: Sequence[tuple[float, float]] = ((1.0, 1.0),),
     share: float = 1.0,
-) -> tuple[Detections, ...]:
+) -> tuple[layers.Detections, ...]:
     """Keypoints of one image from its dense maps, one for each scale, the smallest first.
 
     A map with keypoints is added to the next map. Positions that one map detects are not detected in later maps. Scores
     of the n-th map are divided by n. `ratios` are (width, height) of the image, divided by those of each scale; `share`
     as in `extract`.
     """
-    detections: list[Detections] = []
+    detections: list[layers.Detections] = []
     coarser = detected = None
     for dense, ratio in zip(maps, ratios, strict=True):
         rows, columns, _ = dense.shape
         if coarser is not None:
-            dense = dense + stretch(coarser, rows, columns)
+            dense = dense + layers.stretch(coarser, rows, columns)
         seen = survey(dense)
         if detected is not None:
             detected = detected[_nearest(len(detected), rows)][:, _nearest(detected.shape[1], columns)]
@@ -176,10 +165,11 @@ def survey(dense: Float[Array, "height width channels"]) -> Survey:
     return Survey(channel, score, is_peak & is_blob, step)
 
 
-def select(dense: Float[Array, "height width channels"], seen: Survey, capacity: int) -> Detections:
+def select(dense: Float[Array, "height width channels"], seen: Survey, capacity: int) -> layers.Detections:
     """Keypoints among the detected positions of a map, in min(capacity, height * width) slots.
 
-    Keypoints lie on the map after the refinement, less than half a position from the detected one.
+    Keypoints lie on the map after the refinement, less than half a position from the detected one; they are ordered by
+    channel, then row, then column. A score is the map's value at the detected position.
     """
     height, width, _ = dense.shape
     grid = jnp.stack(jnp.meshgrid(jnp.arange(height), jnp.arange(width), indexing="ij"), axis=-1)
@@ -192,9 +182,9 @@ def select(dense: Float[Array, "height width channels"], seen: Survey, capacity:
     order = jnp.sort(jnp.where(valid, order, jnp.iinfo(order.dtype).max)[strongest])
     place = order % valid.size
     points = position.reshape(-1, 2)[place][:, ::-1]
-    return Detections(
+    return layers.Detections(
         keypoints=points * STRIDE + 1.5,
-        descriptors=of_unit_length(sample(dense, points)),
+        descriptors=layers.of_unit_length(layers.sample(dense, points)),
         scores=seen.score.reshape(-1)[place],
         mask=order < jnp.iinfo(order.dtype).max,
         count=jnp.sum(valid),

@@ -14,20 +14,8 @@ from flax import nnx
 from jaxtyping import Float
 
 from mfvpr.core.types import Array
+from mfvpr.networks import layers
 from mfvpr.networks.backbones import ResNet50, Vgg16, require_position
-from mfvpr.networks.layers import (
-    PRECISION,
-    GeneralizedMean,
-    Images,
-    LayerNorm,
-    Linear,
-    Pixels,
-    PointwiseConv,
-    bias_of,
-    matmul,
-    of_unit_length,
-    preprocess,
-)
 
 IMAGE_SIZE = (320, 320)  # px, width and height, of MixVPR; the mixers' weights depend on it
 _MIXED_CHANNELS, _POSITIONS = 1024, 20 * 20  # of its backbone's maps
@@ -52,38 +40,34 @@ class NetVlad(nnx.Module):
     """
 
     def __init__(self, clusters: int, order: Order = "clusters", *, rngs: nnx.Rngs) -> None:
-        self.assignment = PointwiseConv(CHANNELS, clusters, rngs=rngs)
+        self.assignment = layers.Linear(CHANNELS, clusters, use_bias=False, rngs=rngs)
         self.centers = nnx.Param(jnp.zeros((clusters, CHANNELS), jnp.float32))
         self.order = order
 
     def __call__(self, maps: Float[Array, "batch rows columns channels"]) -> Float[Array, "batch dimensions"]:
         """Descriptors of unit length."""
-        x = of_unit_length(maps.reshape(len(maps), -1, CHANNELS))
-        share = self._shares(x)
-        sums = jnp.einsum("bpk,bpd->bkd", share, x, precision=PRECISION)
+        x = layers.of_unit_length(maps.reshape(len(maps), -1, CHANNELS))
+        share = nnx.softmax(self.assignment(x))
+        sums = jnp.einsum("bpk,bpd->bkd", share, x, precision=layers.PRECISION)
         return self._descriptors(sums - jnp.sum(share, axis=1)[..., None] * self.centers[...][None])
 
     def patches(
         self, maps: Float[Array, "batch rows columns channels"], size: int
     ) -> Float[Array, "batch (rows-{size}+1)*(columns-{size}+1) dimensions"]:
         """Descriptors of all squares of `size` positions, by rows."""
-        x = of_unit_length(maps)
-        residuals = self._shares(x)[..., None] * (x[..., None, :] - self.centers[...][None, None, None])
+        x = layers.of_unit_length(maps)
+        residuals = nnx.softmax(self.assignment(x))[..., None] * (x[..., None, :] - self.centers[...][None, None, None])
         sums = residuals
         for axis in (1, 2):  # a product with ones and zeros; differences of cumulative sums round more
             inside = np.subtract.outer(np.arange(sums.shape[axis]), np.arange(sums.shape[axis] - size + 1))
             band = jnp.asarray((inside >= 0) & (inside < size), sums.dtype)
-            sums = jnp.moveaxis(jnp.tensordot(band, sums, axes=(0, axis), precision=PRECISION), 0, axis)
+            sums = jnp.moveaxis(jnp.tensordot(band, sums, axes=(0, axis), precision=layers.PRECISION), 0, axis)
         return self._descriptors(sums.reshape(len(maps), -1, *sums.shape[3:]))
 
-    def _shares(self, x: Float[Array, "*batch channels"]) -> Float[Array, "*batch clusters"]:
-        """Shares of the clusters for vectors of unit length."""
-        return nnx.softmax(matmul(x, self.assignment.kernel[0, 0]), axis=-1)
-
     def _descriptors(self, sums: Float[Array, "*batch clusters channels"]) -> Float[Array, "*batch dimensions"]:
-        sums = of_unit_length(sums)
+        sums = layers.of_unit_length(sums)
         ordered = sums if self.order == "clusters" else sums.swapaxes(-1, -2)
-        return of_unit_length(ordered.reshape(*sums.shape[:-2], -1))
+        return layers.of_unit_length(ordered.reshape(*sums.shape[:-2], -1))
 
 
 class VggNetVlad(nnx.Module):
@@ -104,25 +88,25 @@ class VggNetVlad(nnx.Module):
         self.dimension = outputs or clusters * CHANNELS
         self.has_components = outputs is not None
         if outputs is not None:
-            self.projection = Linear(clusters * CHANNELS, outputs, rngs=rngs)
+            self.projection = layers.Linear(clusters * CHANNELS, outputs, rngs=rngs)
         self.original = original
         if original:
             self.average = Statistic(jnp.zeros(3, jnp.float32))
 
     require = staticmethod(require_position)
 
-    def preprocess(self, images: Pixels) -> Images:
+    def preprocess(self, images: layers.Pixels) -> layers.Images:
         """RGB images, 0 .. 255, uint8 or float32 -> inputs of the network, float32."""
         if self.original:
             return images.astype(jnp.float32) - self.average[...][None, None, None]
-        return preprocess(images)
+        return layers.preprocess(images)
 
-    def __call__(self, images: Images) -> Float[Array, "batch dimensions"]:
+    def __call__(self, images: layers.Images) -> Float[Array, "batch dimensions"]:
         """Descriptors of unit length of preprocessed images."""
         return self._project(self.pool(self.vgg(images)))
 
     def with_patches(
-        self, images: Images, sizes: tuple[int, ...]
+        self, images: layers.Images, sizes: tuple[int, ...]
     ) -> tuple[Float[Array, "batch dimensions"], tuple[Float[Array, "batch patches dimensions"], ...]]:
         """Descriptors of images, and for each size those of all patches, by rows."""
         maps = self.vgg(images)
@@ -130,7 +114,7 @@ class VggNetVlad(nnx.Module):
         return self._project(self.pool(maps)), tuple(map(self._project, patches))
 
     def _project(self, descriptors: Float[Array, "*batch _"]) -> Float[Array, "*batch dimensions"]:
-        return of_unit_length(self.projection(descriptors)) if self.has_components else descriptors
+        return layers.of_unit_length(self.projection(descriptors)) if self.has_components else descriptors
 
 
 class Gem(nnx.Module):
@@ -144,25 +128,25 @@ class Gem(nnx.Module):
     ) -> None:
         backbone_class, channels = _BACKBONES[backbone]
         self.backbone = backbone_class(rngs=rngs)
-        self.pool = GeneralizedMean()
-        self.projection = Linear(channels, outputs, rngs=rngs)
+        self.pool = layers.GeneralizedMean()
+        self.projection = layers.Linear(channels, outputs, rngs=rngs)
         self.dimension = outputs
         self.has_components = False
 
     require = staticmethod(require_position)
-    preprocess = staticmethod(preprocess)
+    preprocess = staticmethod(layers.preprocess)
 
-    def __call__(self, images: Images) -> Float[Array, "batch dimensions"]:
+    def __call__(self, images: layers.Images) -> Float[Array, "batch dimensions"]:
         """Descriptors of unit length of preprocessed images."""
-        return of_unit_length(self.projection(self.pool(of_unit_length(self.backbone(images)))))
+        return layers.of_unit_length(self.projection(self.pool(layers.of_unit_length(self.backbone(images)))))
 
 
 class FeatureMixer(nnx.Module):
     """Perceptron on the positions of each map, with a shortcut: LayerNorm, Linear, ReLU, Linear."""
 
     def __init__(self, size: int, *, rngs: nnx.Rngs) -> None:
-        self.norm = LayerNorm(size, epsilon=1e-5, rngs=rngs)  # published; a smaller one changes faint maps
-        self.linear1, self.linear2 = (Linear(size, size, rngs=rngs) for _ in range(2))
+        self.norm = layers.LayerNorm(size, epsilon=1e-5, rngs=rngs)  # published; a smaller one changes faint maps
+        self.linear1, self.linear2 = (layers.Linear(size, size, rngs=rngs) for _ in range(2))
 
     def __call__(self, maps: Float[Array, "batch channels positions"]) -> Float[Array, "batch channels positions"]:
         return maps + self.linear2(nnx.relu(self.linear1(self.norm(maps))))
@@ -180,12 +164,12 @@ class MixVPR(nnx.Module):
         self.dimension = out_channels * out_rows
         self.backbone = ResNet50("layer3", rngs=rngs)
         self.mix = nnx.List([FeatureMixer(_POSITIONS, rngs=rngs) for _ in range(4)])
-        self.channel_proj = Linear(_MIXED_CHANNELS, out_channels, rngs=rngs)
-        self.row_proj = Linear(_POSITIONS, out_rows, rngs=rngs)
+        self.channel_proj = layers.Linear(_MIXED_CHANNELS, out_channels, rngs=rngs)
+        self.row_proj = layers.Linear(_POSITIONS, out_rows, rngs=rngs)
 
-    preprocess = staticmethod(preprocess)
+    preprocess = staticmethod(layers.preprocess)
 
-    def __call__(self, images: Images) -> Float[Array, "batch dimensions"]:
+    def __call__(self, images: layers.Images) -> Float[Array, "batch dimensions"]:
         """Descriptors of unit length, channels times rows, from preprocessed images of 320 x 320 px."""
         if images.shape[1:3] != IMAGE_SIZE[::-1]:
             raise ValueError(f"MixVPR takes images of 320 x 320 px only, got {images.shape[2]} x {images.shape[1]}")
@@ -199,6 +183,7 @@ class MixVPR(nnx.Module):
         # Both projections are linear and act on different axes. The rows, of which few remain, are projected first,
         # which saves a sixth of the time; the channels' bias is then summed over the rows' kernel.
         kernel = self.row_proj.kernel[...]
-        bias = jnp.outer(kernel.sum(0), bias_of(self.channel_proj)) + bias_of(self.row_proj)[:, None]
-        projected = matmul(matmul(maps, kernel).swapaxes(1, 2), self.channel_proj.kernel[...]) + bias[None]
-        return of_unit_length(projected.swapaxes(1, 2).reshape(len(maps), self.dimension))
+        bias = jnp.outer(kernel.sum(0), layers.bias_of(self.channel_proj)) + layers.bias_of(self.row_proj)[:, None]
+        by_row = layers.matmul(maps, kernel).swapaxes(1, 2)
+        projected = layers.matmul(by_row, self.channel_proj.kernel[...]) + bias[None]
+        return layers.of_unit_length(projected.swapaxes(1, 2).reshape(len(maps), self.dimension))

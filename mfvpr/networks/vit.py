@@ -9,16 +9,7 @@ from flax import nnx
 from jaxtyping import Float
 
 from mfvpr.core.types import Array
-from mfvpr.networks.layers import (
-    PRECISION,
-    GeneralizedMean,
-    Images,
-    LayerNorm,
-    Linear,
-    matmul,
-    of_unit_length,
-    preprocess,
-)
+from mfvpr.networks import layers
 from mfvpr.utils.errors import InputError
 
 Pooling = Literal["cls", "gem"]
@@ -32,8 +23,6 @@ _CUBIC = -0.75  # torch's parameter of bicubic interpolation
 
 
 class Tokens(NamedTuple):
-    """Output of a transformer."""
-
     class_token: Float[Array, "batch width"]
     maps: Float[Array, "batch rows columns width"]  # tokens of the patches
 
@@ -45,33 +34,18 @@ class BlockOutput(NamedTuple):
     """
 
     token: Float[Array, "batch rows columns width"]  # after the block, normalized as the last tokens
-    query: Float[Array, "batch rows columns width"]
-    key: Float[Array, "batch rows columns width"]
-    value: Float[Array, "batch rows columns width"]
+    query: Array
+    key: Array
+    value: Array
     attention: Float[Array, "batch rows columns"]  # of the class token, mean over the heads
-
-
-class Patches(nnx.Module):
-    """Linear map of each patch: `kernel` `[14, 14, 3, D]`, `bias` `[D]`."""
-
-    def __init__(self, width: int, *, rngs: nnx.Rngs) -> None:
-        initial = nnx.initializers.lecun_normal()
-        self.kernel = nnx.Param(initial(rngs.params(), (PATCH, PATCH, 3, width), jnp.float32))
-        self.bias = nnx.Param(jnp.zeros(width, jnp.float32))
-
-    def __call__(self, images: Images) -> Float[Array, "batch (height//14)*(width//14) dimensions"]:
-        batch, rows, columns = len(images), images.shape[1] // PATCH, images.shape[2] // PATCH
-        pixels = images.reshape(batch, rows, PATCH, columns, PATCH, 3).swapaxes(2, 3)
-        kernel = self.kernel[...].reshape(-1, self.kernel.shape[-1])
-        return matmul(pixels.reshape(batch, rows * columns, -1), kernel) + self.bias[...][None, None]
 
 
 class Attention(nnx.Module):
     """Multi-head self-attention of tokens."""
 
     def __init__(self, width: int, heads: int, *, rngs: nnx.Rngs) -> None:
-        self.qkv = Linear(width, 3 * width, rngs=rngs)
-        self.output = Linear(width, width, rngs=rngs)
+        self.qkv = layers.Linear(width, 3 * width, rngs=rngs)
+        self.output = layers.Linear(width, width, rngs=rngs)
         self.heads = heads
 
     def split(self, x: Float[Array, "batch tokens width"]) -> Float[Array, "3 batch heads tokens width//heads"]:
@@ -82,9 +56,9 @@ class Attention(nnx.Module):
     def __call__(self, x: Float[Array, "batch tokens width"]) -> Float[Array, "batch tokens width"]:
         queries, keys, values = self.split(x)
         queries = queries * queries.shape[-1] ** -0.5
-        logits = matmul(queries, keys.swapaxes(2, 3))
+        logits = layers.matmul(queries, keys.swapaxes(2, 3))
         weights = jnp.exp(logits - jnp.max(logits, axis=-1, keepdims=True))
-        context = matmul(weights, values) / jnp.sum(weights, axis=-1, keepdims=True)
+        context = layers.matmul(weights, values) / jnp.sum(weights, axis=-1, keepdims=True)
         return self.output(jnp.moveaxis(context, 1, 2).reshape(x.shape))
 
 
@@ -92,7 +66,7 @@ class Perceptron(nnx.Module):
     """Two linear layers with GELU or ReLU between them."""
 
     def __init__(self, width: int, hidden: int, *, relu: bool = False, rngs: nnx.Rngs) -> None:
-        self.hidden, self.output = Linear(width, hidden, rngs=rngs), Linear(hidden, width, rngs=rngs)
+        self.hidden, self.output = layers.Linear(width, hidden, rngs=rngs), layers.Linear(hidden, width, rngs=rngs)
         self.relu = relu
 
     def __call__(self, x: Float[Array, "batch tokens width"]) -> Float[Array, "batch tokens width"]:
@@ -104,7 +78,7 @@ class Block(nnx.Module):
     """x + scale1 attention(norm1(x)), then x + scale2 perceptron(norm2(x))."""
 
     def __init__(self, width: int, heads: int, *, rngs: nnx.Rngs) -> None:
-        self.norm1, self.norm2 = (LayerNorm(width, epsilon=_EPSILON, rngs=rngs) for _ in range(2))
+        self.norm1, self.norm2 = (layers.LayerNorm(width, epsilon=_EPSILON, rngs=rngs) for _ in range(2))
         self.attention = Attention(width, heads, rngs=rngs)
         self.perceptron = Perceptron(width, 4 * width, rngs=rngs)
         self.scale1, self.scale2 = (nnx.Param(jnp.ones(width, jnp.float32)) for _ in range(2))
@@ -124,60 +98,58 @@ class VisionTransformer(nnx.Module):
     def __init__(
         self, width: int, depth: int, heads: int, *, registers: int = 0, block: type[Block] = Block, rngs: nnx.Rngs
     ) -> None:
-        self.patches = Patches(width, rngs=rngs)
+        patch = {"kernel_size": (PATCH, PATCH), "strides": PATCH, "padding": "VALID"}
+        self.patches = nnx.Conv(3, width, **patch, precision=layers.PRECISION, rngs=rngs)
         self.first = nnx.Param(jnp.zeros(width, jnp.float32))  # the class token
         self.positions = nnx.Param(jnp.zeros((1 + _TRAINED**2, width), jnp.float32))
         if registers:
             self.registers = nnx.Param(jnp.zeros((registers, width), jnp.float32))
         self.has_registers = registers > 0
         self.blocks = nnx.List([block(width, heads, rngs=rngs) for _ in range(depth)])
-        self.norm = LayerNorm(width, epsilon=_EPSILON, rngs=rngs)
-        self.width = width
+        self.norm = layers.LayerNorm(width, epsilon=_EPSILON, rngs=rngs)
+        self.dimension = width
 
-    preprocess = staticmethod(preprocess)
+    preprocess = staticmethod(layers.preprocess)
 
-    def __call__(self, images: Images) -> Tokens:
+    def __call__(self, images: layers.Images) -> Tokens:
         """Normalized tokens of preprocessed images."""
         return self._tokens(self._states(images)[-1], images)
 
-    def with_block(self, images: Images, index: int) -> tuple[Tokens, BlockOutput]:
+    def with_block(self, images: layers.Images, index: int) -> tuple[Tokens, BlockOutput]:
         """Normalized tokens of preprocessed images, and the output of the block with this index."""
         states = self._states(images)
         place, block = index % len(self.blocks), self.blocks[index]
         parts = block.attention.split(block.norm1(states[place]))
         joined = jnp.moveaxis(parts, 2, 3).reshape(3, *states[place].shape)
         of_class = parts[0, :, :, :1] * parts.shape[-1] ** -0.5  # query of the class token, the first
-        attention = jax.nn.softmax(matmul(of_class, parts[1].swapaxes(2, 3))[:, :, 0], axis=-1)
+        attention = jax.nn.softmax(layers.matmul(of_class, parts[1].swapaxes(2, 3))[:, :, 0], axis=-1)
         values = (self.norm(states[place + 1]), *joined, jnp.mean(attention, axis=1))
         return self._tokens(states[-1], images), BlockOutput(*(_maps(each, images) for each in values))
 
-    def _states(self, images: Images) -> list[Float[Array, "batch tokens dimensions"]]:
+    def _states(self, images: layers.Images) -> list[Float[Array, "batch tokens dimensions"]]:
         """Inputs of the blocks, and the output of the last; the first has class token, registers and patches."""
         positions = _resize_positions(self.positions[...][1:], images.shape[1] // PATCH, images.shape[2] // PATCH)
         first = (self.first[...] + self.positions[...][0])[None]
         extra = jnp.concatenate([first, self.registers[...]]) if self.has_registers else first
         extra = jnp.broadcast_to(extra, (len(images), *extra.shape))
-        states = [jnp.concatenate([extra, self.patches(images) + positions[None]], axis=1)]
+        patches = self.patches(images).reshape(len(images), -1, self.dimension)
+        states = [jnp.concatenate([extra, patches + positions[None]], axis=1)]
         for block in self.blocks:
             states.append(block(states[-1]))
         return states
 
-    def _tokens(self, state: Float[Array, "batch tokens dimensions"], images: Images) -> Tokens:
+    def _tokens(self, state: Float[Array, "batch tokens dimensions"], images: layers.Images) -> Tokens:
         normalized = self.norm(state)
         return Tokens(normalized[:, 0], _maps(normalized, images))
 
 
-def _maps(
-    x: Float[Array, "batch tokens *dimensions"], images: Images
-) -> Float[Array, "batch rows columns *dimensions"]:
+def _maps(x: Float[Array, "batch tokens *dimensions"], images: layers.Images) -> Array:
     """Values of the patches' tokens, which are the last."""
     rows, columns = images.shape[1] // PATCH, images.shape[2] // PATCH
     return x[:, -rows * columns :].reshape(len(x), rows, columns, *x.shape[2:])
 
 
-def _resize_positions(
-    learned: Float[Array, "positions width"], rows: int, columns: int
-) -> Float[Array, "{rows}*{columns} width"]:
+def _resize_positions(learned: Array, rows: int, columns: int) -> Float[Array, "{rows}*{columns} width"]:
     """Position encodings of the patches: the learned ones, resized by bicubic interpolation; edges repeat.
 
     Places are `_TRAINED / (count + 0.1)` apart, and there is no antialiasing, as published.
@@ -194,7 +166,7 @@ def _resize_positions(
             far = ((distance - 5) * distance + 8) * distance * _CUBIC - 4 * _CUBIC
             pixel = np.clip(before + step, 0, _TRAINED - 1)
             np.add.at(matrix, (np.arange(count), pixel), np.where(distance <= 1, near, far))
-        resized = jnp.tensordot(jnp.asarray(matrix, jnp.float32), grid, axes=(1, axis), precision=PRECISION)
+        resized = jnp.tensordot(jnp.asarray(matrix, jnp.float32), grid, axes=(1, axis), precision=layers.PRECISION)
         grid = jnp.moveaxis(resized, 0, axis)
     return grid.reshape(rows * columns, -1)
 
@@ -216,18 +188,18 @@ class TokenDescriptor(nnx.Module):
 
     def __init__(self, network: VisionTransformer, pooling: Pooling = "cls", power: float = 3.0) -> None:
         self.network = network
-        self.pool = GeneralizedMean(power)
+        self.pool = layers.GeneralizedMean(power)
         self.pooling = pooling
-        self.dimension = network.width
+        self.dimension = network.dimension
         self.has_components = False
 
-    preprocess = staticmethod(preprocess)
+    preprocess = staticmethod(layers.preprocess)
     require = staticmethod(require_patches)
 
-    def __call__(self, images: Images) -> Float[Array, "batch dimensions"]:
+    def __call__(self, images: layers.Images) -> Float[Array, "batch dimensions"]:
         """Descriptors of unit length of preprocessed images."""
         class_token, maps = self.network(images)
-        return of_unit_length(class_token if self.pooling == "cls" else self.pool(of_unit_length(maps)))
+        return layers.of_unit_length(class_token if self.pooling == "cls" else self.pool(layers.of_unit_length(maps)))
 
 
 class AdaptedBlock(Block):
@@ -261,7 +233,7 @@ class Upsampling(nnx.Module):
         self, x: Float[Array, "batch rows columns inputs"]
     ) -> Float[Array, "batch 2*rows-1 2*columns-1 outputs"]:
         """Multiply by the whole kernel at once, then add neighbors, which avoids products with zeros."""
-        parts = jnp.tensordot(x, self.kernel[...], axes=(3, 2), precision=PRECISION)  # [B, h, w, 3, 3, D]
+        parts = jnp.tensordot(x, self.kernel[...], axes=(3, 2), precision=layers.PRECISION)  # [B, h, w, 3, 3, D]
         for axis in (1, 2):  # n positions add three outputs each, which become 2 n - 1
             before, here, after = (jnp.take(parts, place, axis=3) for place in range(3))
             between = after + jnp.roll(before, -1, axis)  # the last is dropped
@@ -282,16 +254,16 @@ class SelaVpr(nnx.Module):
         self, width: int = 1024, depth: int = 24, heads: int = 16, *, registers: int = 0, rngs: nnx.Rngs
     ) -> None:
         self.backbone = VisionTransformer(width, depth, heads, registers=registers, block=AdaptedBlock, rngs=rngs)
-        self.pool = GeneralizedMean()
+        self.pool = layers.GeneralizedMean()
         self.upsampling1, self.upsampling2 = Upsampling(width, 256, rngs=rngs), Upsampling(256, LOCAL, rngs=rngs)
         self.dimension = width
 
-    preprocess = staticmethod(preprocess)
+    preprocess = staticmethod(layers.preprocess)
 
     def __call__(
-        self, images: Images
+        self, images: layers.Images
     ) -> tuple[Float[Array, "batch dimensions"], Float[Array, "batch 4*(height//14)-3 4*(width//14)-3 128"]]:
         """Global descriptors and local descriptors of unit length of preprocessed images."""
         maps = self.backbone(images).maps
         local = self.upsampling2(nnx.relu(self.upsampling1(maps)))
-        return of_unit_length(self.pool(of_unit_length(maps))), of_unit_length(local)
+        return layers.of_unit_length(self.pool(layers.of_unit_length(maps))), layers.of_unit_length(local)

@@ -1,7 +1,7 @@
 """Results for people: tables, figures, pages, and the files of a run folder.
 
-Read first: results (`mfvpr.evaluate`), runs (run folders), tables, evaluations and run_files
-(files of an evaluation), sweeps, comparisons (of learning), figures, then pages/ (HTML).
+Read first: results (`mfvpr.evaluate`), evaluations and run_files (files of an evaluation), runs (tables and run
+folders), searches (sweeps and learning), figures, then pages (HTML).
 """
 
 import lazy_loader

@@ -9,5 +9,4 @@ __all__ = [
 ]
 
 from .results import Result, TopPrediction, evaluate
-from .runs import claim_run_folder, write_json, write_table
-from .tables import Table
+from .runs import Table, claim_run_folder, write_json, write_table

@@ -13,21 +13,13 @@ from jaxtyping import Bool, Float, Shaped
 from mfvpr.core.histogram import HistogramOfShifts
 from mfvpr.datasets.datasets import MEANS, QuerySequence
 from mfvpr.datasets.ground_truth import Truth, Unit, middle, threshold_words
-from mfvpr.datasets.positives import Positives
-from mfvpr.evaluation.confidence import (
-    CalibrationData,
-    Confidence,
-    PrecisionRecall,
-    absent_ranking,
-    calibration_data,
-    chance_calibration_error,
-    precision_recall,
-    reliability,
-)
+from mfvpr.datasets.positives import Positives, stack_positives
+from mfvpr.evaluation import confidence
+from mfvpr.evaluation.confidence import CalibrationData, Confidence, PrecisionRecall
 from mfvpr.evaluation.dataset_ranking import KS, RankedDataset, Reason
 from mfvpr.evaluation.protocol import Half, halves, halves_of_map
-from mfvpr.report.runs import file_names
-from mfvpr.report.tables import Table, table_of
+from mfvpr.evaluation.rankings import Ranked
+from mfvpr.report.runs import Table, file_names, table_of
 from mfvpr.utils.errors import InputError
 
 NO_PLACE = "no place"  # the prediction for a query whose place the database does not seem to show
@@ -36,36 +28,25 @@ _UNITS: Mapping[str, Unit] = {"tolerance": "frames", "radius": "m"}  # of a thre
 
 @dataclass(frozen=True)
 class EvaluationReport:
-    """Rankings of a data set by a system, and the criteria of their report; arrays are of Q queries.
-
-    Attributes:
-        ranked: rankings of all sequences.
-        thresholds: distances within which a prediction is correct, sorted; empty = the default of the programs, or none
-            without ground truth.
-        ks: depths of recall, sorted.
-        confidences: by system, fitted on other images; None = with ground truth, each half of the path has the
-            confidence that was fitted on the other half.
-        least_confidence: below which the prediction is `NO_PLACE`; None = no prediction is refused.
-        lacking: by sequence, why evidence is lacking for predictions of the system that decides, which are then
-            `NO_PLACE`, see `mfvpr.evaluation.evidence`; None = not tested.
-    """
+    """Rankings of a data set by a system, and the criteria of their report; arrays are of Q queries."""
 
     ranked: RankedDataset
-    thresholds: Sequence[float] = ()
-    ks: Sequence[int] = KS
+    thresholds: Sequence[float] = ()  # of a correct prediction, sorted; empty = the default of the programs
+    ks: Sequence[int] = KS  # depths of recall, sorted
+    # By system, fitted on other images; None = with ground truth, each half of the path has a fit on the other half.
     confidences: Mapping[str, Confidence] | None = None
-    least_confidence: float | None = None
+    least_confidence: float | None = None  # below which the prediction is `NO_PLACE`; None = none is refused
+    # By sequence, why evidence is lacking for predictions of the system that decides, which are then `NO_PLACE`.
     lacking: Sequence[Sequence[Reason | None]] | None = None
 
     def __post_init__(self) -> None:
-        truth = self.sequences[0].truth
-        thresholds = [] if truth is None else self.thresholds or truth.thresholds()
+        thresholds = [] if self.truth is None else self.thresholds or self.truth.thresholds()
         object.__setattr__(self, "thresholds", sorted({*thresholds}))
         object.__setattr__(self, "ks", sorted({*self.ks}))
 
     @property
     def headline(self) -> str:
-        """The final score that decides, in predictions.csv and in figures."""
+        """The final score that decides."""
         return self.ranked.system.headline
 
     @property
@@ -85,13 +66,17 @@ class EvaluationReport:
         """The data set's query sequences."""
         return self.ranked.dataset.sequences
 
+    @property
+    def truth(self) -> Truth | None:
+        """Ground truth of the first sequence; the others have one of the same unit, if there is any."""
+        return self.sequences[0].truth
+
     def rows(self) -> list[dict[str, Any]]:
         """Recall by K of every system, threshold and sequence; behind several sequences, of their means.
 
-        A row has "system" and "decides", with several sequences "sequence", the "tolerance" or "radius", and
-        "recall_at", which is empty without ground truth.
+        "sequence" is there if there are several; "recall_at" is empty without ground truth.
         """
-        truth, rows = self.sequences[0].truth, list[dict[str, Any]]()
+        truth, rows = self.truth, list[dict[str, Any]]()
         if truth is None:
             names = self.ranked.systems
             return [{"system": name, "decides": name == self.headline, "recall_at": {}} for name in names]
@@ -108,84 +93,84 @@ class EvaluationReport:
         return rows
 
     @cached_property
-    def positives(self) -> Sequence[Positives | None]:
-        """Positives of each sequence, within `threshold`."""
-        return self.ranked.positives(self.threshold) if self.thresholds else [None] * len(self.sequences)
+    def queries(self) -> list[tuple[QuerySequence, str]]:
+        """Sequence and name of each of the Q queries, sequence by sequence."""
+        return [(sequence, name) for sequence in self.sequences for name in sequence.images.names]
 
-    def is_correct(self, system: str, place: int) -> Bool[np.ndarray, "queries candidates"] | None:
-        """Whether candidates are correct, in the order of a system's ranking of the sequence at a place."""
-        positives = self.positives[place]
-        return None if positives is None else positives.contains(self.ranked.systems[system][place].rows)
+    @cached_property
+    def parts(self) -> list[slice]:
+        """The queries of each sequence."""
+        ends = np.cumsum([len(sequence.images) for sequence in self.sequences]).tolist()
+        return [slice(start, end) for start, end in itertools.pairwise([0, *ends])]
+
+    @cached_property
+    def rankings(self) -> dict[str, Ranked]:
+        """Rankings of all queries, by system."""
+        rankings = {}
+        for name, parts in self.ranked.systems.items():
+            rows, scores = [part.rows for part in parts], [part.scores for part in parts]
+            rankings[name] = Ranked(np.concatenate(rows), np.concatenate(scores))
+        return rankings
+
+    @cached_property
+    def positives(self) -> Positives | None:
+        """Positives of all queries, within `threshold`; None without ground truth."""
+        return stack_positives(self.ranked.positives(self.threshold)) if self.thresholds else None
+
+    @cached_property
+    def correct(self) -> dict[str, Bool[np.ndarray, "queries candidates"]]:
+        """Whether candidates are correct, in the order of the ranking, by system; empty without ground truth."""
+        known = self.positives
+        return {} if known is None else {name: known.contains(each.rows) for name, each in self.rankings.items()}
 
     def hits(self, system: str) -> Bool[np.ndarray, " queries"]:
-        """Whether the first prediction is correct, for the queries of all sequences, with ground truth."""
-        places = range(len(self.sequences))
-        return np.concatenate([np.asarray(self.is_correct(system, place), bool)[:, 0] for place in places])
-
-    @property
-    def num_queries(self) -> int:
-        """Number of queries of all sequences."""
-        return sum(len(sequence.images) for sequence in self.sequences)
-
-    def by_sequence(self, values: Shaped[np.ndarray, " _"]) -> list[Shaped[np.ndarray, " _"]]:
-        """Split values of the queries of all sequences into those of each sequence."""
-        return np.split(values, np.cumsum([len(sequence.images) for sequence in self.sequences])[:-1])
+        """Whether the first prediction is correct, with ground truth."""
+        return self.correct[system][:, 0]
 
     def folder(self, run: Path, place: int) -> Path:
         """The folder of the sequence at a place."""
         return sequence_folder(run, [sequence.name for sequence in self.sequences], place)
 
     @cached_property
-    def both_probabilities(self) -> dict[str, Float[np.ndarray, "2 queries"]]:
-        """Confidence by system, of the queries as they are, and without the images of their place; NaN = unknown.
+    def probabilities(self) -> dict[str, Float[np.ndarray, "2 queries"]]:
+        """Confidence by system, of the queries as they are, and without the images of their place.
 
         Without `confidences`, each half of the path has those of a fit on the other, without what shows places of both.
+        NaN without a prediction, or without anything to fit on.
         """
         names = self.calibration if self.confidences is None else self.confidences
-        probabilities = {name: np.full((2, self.num_queries), np.nan) for name in names if name in self.ranked.systems}
-        for name, (present, absent) in probabilities.items():
+        both = {name: np.full((2, len(self.queries)), np.nan) for name in names if name in self.rankings}
+        for name, (present, absent) in both.items():
             if self.confidences is not None:
-                fitted, rankings = self.confidences[name], self.ranked.systems[name]
-                present[:] = np.concatenate([fitted(ranked) for ranked in rankings])
-                if self.thresholds:
-                    parts = zip(rankings, self._truths, strict=True)
-                    without = [absent_ranking(ranked, truth, self.threshold) for ranked, truth in parts]
-                    absent[:] = np.concatenate([fitted(ranked) for ranked in without])
+                present[:] = self.confidences[name](self.rankings[name])
+                parts = self.parts, self.ranked.systems[name], self._truths
+                for part, ranked, truth in zip(*parts, strict=True) if self.thresholds else ():
+                    absent[part] = self.confidences[name](confidence.absent_ranking(ranked, truth, self.threshold))
                 continue
             for half in self.path_halves():
                 tune, report = self.calibration[name].take(half.tune), self.calibration[name].take(half.report)
                 if np.isfinite(tune.present).all(axis=1).any():
-                    confidence = tune.fit()
-                    present[half.report] = confidence.probability(report.present)
-                    absent[half.report] = confidence.probability(report.absent)
-        return probabilities
-
-    @property
-    def probabilities(self) -> dict[str, Float[np.ndarray, " queries"]]:
-        """Confidence by system, NaN without a prediction, or without anything to fit on."""
-        return {name: present for name, (present, _) in self.both_probabilities.items()}
+                    fitted = tune.fit()
+                    present[half.report] = fitted.probability(report.present)
+                    absent[half.report] = fitted.probability(report.absent)
+        return both
 
     @cached_property
     def calibration(self) -> dict[str, CalibrationData]:
         """Data that the confidence of a system is fitted on, by system; nothing without ground truth."""
         calibration = {}
-        for name in self.ranked.systems if self.thresholds else ():
-            pairs = zip(self.ranked.systems[name], self._truths, strict=True)
-            parts = [calibration_data(ranked, truth, self.threshold) for ranked, truth in pairs]
+        for name, rankings in self.ranked.systems.items() if self.thresholds else ():
+            pairs = zip(rankings, self._truths, strict=True)
+            parts = [confidence.calibration_data(ranked, truth, self.threshold) for ranked, truth in pairs]
             calibration[name] = CalibrationData(*map(np.concatenate, zip(*parts, strict=True)))
         return calibration
 
-    def scores(self, system: str) -> Float[np.ndarray, " queries"]:
-        """Scores of the first predictions, NaN without one."""
-        parts = self.ranked.systems[system]
-        return np.concatenate([np.where(ranked.rows[:, 0] >= 0, ranked.scores[:, 0], np.nan) for ranked in parts])
-
     def reasons(self, system: str) -> Shaped[np.ndarray, " queries"]:
         """Why predictions are `NO_PLACE`, objects; None = they are not."""
-        reasons = np.full(self.num_queries, None, object)
+        reasons = np.full(len(self.queries), None, object)
         if self.least_confidence is not None:
-            reasons[~(self.probabilities[system] >= self.least_confidence)] = "low confidence"
-        reasons[np.concatenate([ranked.rows[:, 0] < 0 for ranked in self.ranked.systems[system]])] = "no candidates"
+            reasons[~(self.probabilities[system][0] >= self.least_confidence)] = "low confidence"
+        reasons[self.rankings[system].rows[:, 0] < 0] = "no candidates"
         if self.lacking is not None and system == self.headline:
             for query, reason in enumerate(itertools.chain(*self.lacking)):
                 reasons[query] = reason or reasons[query]
@@ -193,21 +178,19 @@ class EvaluationReport:
 
     def refusals(self, system: str) -> Bool[np.ndarray, " queries"]:
         """Whether the threshold or the evidence refuses the prediction."""
-        if self.least_confidence is None:
-            return np.zeros(self.num_queries, bool)
-        return np.array([reason is not None for reason in self.reasons(system)])
+        return np.array([self.least_confidence is not None and each is not None for each in self.reasons(system)])
 
     def curves(self, system: str) -> dict[str, PrecisionRecall]:
         """Precision and recall by the score, and by the confidence where it is known; with ground truth."""
-        has_positives = np.concatenate([part.counts > 0 for part in self.positives if part is not None])
-        values = {"score": self.scores(system)}
+        ranked = self.rankings[system]
+        values = {"score": np.where(ranked.rows[:, 0] >= 0, ranked.scores[:, 0], np.nan)}
         if system in self.probabilities:
-            values["confidence"] = self.probabilities[system]
-        return {by: precision_recall(each, self.hits(system), has_positives) for by, each in values.items()}
+            values["confidence"] = self.probabilities[system][0]
+        has_positives = None if self.positives is None else self.positives.counts > 0
+        return {by: confidence.precision_recall(each, self.hits(system), has_positives) for by, each in values.items()}
 
     @property
     def _truths(self) -> list[Truth]:
-        """Ground truth of each sequence, if there is any."""
         return [sequence.truth for sequence in self.sequences if sequence.truth is not None]
 
     def path_halves(self) -> tuple[Half, Half]:
@@ -246,28 +229,26 @@ def recall_table(rows: Iterable[Mapping[str, Any]]) -> Table:
 def confidence_table(evaluation: EvaluationReport) -> Table:
     """Average precision, recall at 100 and 99 % precision, by score and by confidence; calibration; all in percent.
 
-    "ECE" is the expected calibration error of the queries as they are, "by chance" that of a perfectly calibrated
-    confidence. "ECE with absent" counts each query once more without the images of its place, as the fits do. With
+    "ECE with absent" counts each query once more without the images of its place, as the fits do. With
     `least_confidence`, counts of queries follow.
     """
+    is_refusing, rows = evaluation.least_confidence is not None, []
     header = [f"{name} by {by}" for by in ("score", "confidence") for name in ("AP", "R@100P", "R@99P")]
     header += ["ECE", "by chance", "ECE with absent"]
-    rows = []
-    for name, probabilities in evaluation.probabilities.items():
-        fractions = []
+    header += ["correct", "incorrect", "refused", "of these correct"] if is_refusing else []
+    for name, (present, absent) in evaluation.probabilities.items():
+        correct, fractions = evaluation.hits(name), list[float]()
         for curve in evaluation.curves(name).values():
             fractions += [curve.average_precision, curve.recall_at(1.0), curve.recall_at(0.99)]
-        correct = evaluation.hits(name)
-        fractions += [reliability(probabilities, correct).calibration_error, chance_calibration_error(probabilities)]
-        both = np.concatenate(evaluation.both_probabilities[name])
-        fractions.append(reliability(both, np.append(correct, np.zeros(len(correct), bool))).calibration_error)
-        known = 3 if np.isnan(probabilities).all() else len(fractions)  # an unknown confidence has empty cells
+        never = np.zeros(len(correct), bool)
+        with_absent = confidence.reliability(np.append(present, absent), np.append(correct, never))
+        fractions.append(confidence.reliability(present, correct).calibration_error)
+        fractions += [confidence.chance_calibration_error(present), with_absent.calibration_error]
+        known = 3 if np.isnan(present).all() else len(fractions)  # an unknown confidence has empty cells
         cells = [f"{100 * value:.1f}" for value in fractions[:known]] + [""] * (len(fractions) - known)
-        if evaluation.least_confidence is not None:
+        if is_refusing:
             refused = evaluation.refusals(name)
             counts = (correct & ~refused, ~correct & ~refused, refused, refused & correct)
             cells += [str(int(selection.sum())) for selection in counts]
         rows.append([name, *cells])
-    if evaluation.least_confidence is not None:
-        header += ["correct", "incorrect", "refused", "of these correct"]
     return Table(["system", *header], rows)

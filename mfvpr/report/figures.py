@@ -1,5 +1,6 @@
 """Figures of images: a pair beside its histogram of shifts, for queries and localized images; contact sheets."""
 
+import warnings
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
@@ -11,7 +12,9 @@ import jax
 import numpy as np
 from jaxtyping import Shaped, UInt8
 from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.collections import LineCollection
+from matplotlib.figure import Figure as Canvas
 from matplotlib.image import AxesImage
 from matplotlib.patches import Rectangle
 from PIL import Image
@@ -25,13 +28,13 @@ from mfvpr.evaluation.stages import Explanation, explain
 from mfvpr.localization.map import Map
 from mfvpr.localization.predictions import Localization
 from mfvpr.report.evaluations import EvaluationReport
-from mfvpr.report.plots import panels, save_figure
 from mfvpr.report.runs import Figure
 from mfvpr.utils.errors import InputError
-from mfvpr.utils.files import clip_middle, path_inside, printable
+from mfvpr.utils.files import clip_middle, path_inside, printable, replacing, require_replaceable
 
 ABOUT: tuple[str, ...] = ("system", "sequence", "outcome", "query", "prediction")  # keywords in the file of a figure
 _AGREES, _DIFFERS = "#2fa8ff", "#ff9a1f"  # told apart by color-blind people as well
+_SOFTWARE = b"mfvpr.report"  # at the start of every PNG file
 _MATCHES = 30  # drawn, the heaviest, as in the paper
 _GAP = 12  # px between the two images
 _GRAY = 150  # of an image that is not at hand
@@ -40,17 +43,40 @@ _PAIRS = 12  # of a contact sheet; at least two of each sequence
 _SIDE = 320  # px of the longer side of an image on the sheet
 
 
+def panels(number: int, width: float, height: float, columns: int = 4, **options: Any) -> tuple[Canvas, list[Axes]]:
+    """Make a figure of panels, each of `width` x `height` inches, in rows of at most `columns`.
+
+    `options` go to `Figure.subplots`.
+    """
+    columns = min(columns, number)
+    rows = -(-number // columns)
+    figure = Canvas(figsize=(width * columns, height * rows), layout="constrained")
+    FigureCanvasAgg(figure)
+    axes = [*figure.subplots(rows, columns, squeeze=False, **options).flat]
+    for unused in axes[number:]:
+        unused.set_axis_off()
+    return figure, axes[:number]
+
+
+def save_figure(figure: Canvas, path: Path, *, dpi: int = 110, **options: Any) -> None:
+    """Write an image file; `options` go to `Figure.savefig`. Of existing files, only a PNG from here is replaced."""
+    is_png = path.suffix == ".png"
+    require_replaceable(path, _SOFTWARE if is_png else None)
+    if is_png:
+        options["metadata"] = {"Software": _SOFTWARE.decode(), **options.get("metadata", {})}
+    with replacing(path) as temporary, warnings.catch_warnings():
+        warnings.filterwarnings("ignore", message="Glyph .* missing")  # names in scripts that the font lacks
+        figure.savefig(temporary, dpi=dpi, **options)
+
+
 @dataclass(frozen=True)
 class Candidate:
-    """A database image beside the query, at the size that the points refer to, and its caption.
+    """A database image beside the query."""
 
-    `matches` `[K, ...]` of this pair (NumPy) and their `explanation` are None if the image was not matched.
-    """
-
-    image: UInt8[np.ndarray, "height width 3"]
+    image: UInt8[np.ndarray, "height width 3"]  # at the size that the points refer to
     caption: str
-    matches: Matches | None = None
-    explanation: Explanation | None = None
+    matches: Matches | None = None  # [K, ...] of this pair (NumPy); None if the image was not matched
+    explanation: Explanation | None = None  # of the matches
 
 
 def histogram_figure(
@@ -59,22 +85,22 @@ def histogram_figure(
     candidates: Sequence[Candidate],
     *,
     title: str,
-    pixel_aspect: float = 1.0,
+    original: Shaped[np.ndarray, "_ _ 3"],
     about: Mapping[str, str] | None = None,
 ) -> None:
     """Write the figure of one query, with candidates one below the other, their histograms in the same colors.
 
-    The query's image has the size that the points refer to. `pixel_aspect` is the height of a pixel by its width, so
-    that images are drawn in the shape that they were taken in. `about` is text by keyword in the file, for programs.
+    The query's image has the size that the points refer to. Images are drawn in the shape of the `original`, which has
+    square pixels. `about` is text by keyword in the file, for programs.
     """
-    count = len(candidates)
+    (height, width, _), shown, count = original.shape, query_image.shape, len(candidates)
     figure, axes = panels(2 * count, 6, 4.8 + 0.2 / count, columns=2, width_ratios=(2, 1.15))
     # A file's name may hold a $.
     figure.suptitle(clip_middle(printable(title), _TITLE_LENGTH), fontsize=11, parse_math=False)
     top = max([1e-9, *(float(candidate.explanation.score) for candidate in candidates if candidate.explanation)])
     for pair, heat, candidate in zip(axes[::2], axes[1::2], candidates, strict=True):
         _draw_pair(pair, query_image, candidate)
-        pair.set_aspect(pixel_aspect)
+        pair.set_aspect((height / shown[0]) / (width / shown[1]))  # of a pixel
         if candidate.explanation is None:
             heat.set_axis_off()
         else:
@@ -128,12 +154,6 @@ def _draw_histogram(axes: Axes, explanation: Explanation, top: float) -> AxesIma
     return image
 
 
-def pixel_aspect_of(original: Shaped[np.ndarray, "_ _ 3"], smaller: Shaped[np.ndarray, "_ _ 3"]) -> float:
-    """Height of a pixel of a resized image by its width, where pixels of the original are squares."""
-    (height, width), (new_height, new_width) = original.shape[:2], smaller.shape[:2]
-    return (height / new_height) / (width / new_width)
-
-
 def query_figures(report: EvaluationReport, shown: int | Sequence[int]) -> list[Figure]:
     """The paper's figure for so many queries of each sequence, correct and incorrect ones, or for the rows `shown`."""
     figures: list[Figure] = []
@@ -150,12 +170,12 @@ class SequenceFigures:
 
     def __init__(self, report: EvaluationReport, place: int) -> None:
         """Take the parts of the sequence at a place, by the system that decides."""
-        headline = report.headline
+        headline, part, positives = report.headline, report.parts[place], report.positives
         self._report, self._sequence = report, report.sequences[place]
         self._matched, self._database = report.ranked.matched[place], report.ranked.dataset.database
-        self._ranked, self._correct = report.ranked.systems[headline][place], report.is_correct(headline, place)
-        self._reasons = report.by_sequence(report.reasons(headline))[place]
-        self._positives = report.positives[place]
+        self._ranked, self._reasons = report.ranked.systems[headline][place], report.reasons(headline)[part]
+        self._correct = None if positives is None else report.correct[headline][part]
+        self._positives = None if positives is None else positives.take(part)
 
     def verdicts(self, selection: int | Sequence[int]) -> dict[int, str]:
         """Verdicts of queries that get a figure: the selected rows, or so many, half of them correct if known."""
@@ -183,8 +203,7 @@ class SequenceFigures:
         title = f"{headline}, {verdict}{within}: {_short(name)} -> {_short(prediction)}{note}"
         about = dict(zip(ABOUT, (headline, sequence.name, verdict, name, prediction), strict=True))
         original = sequence.images.read(query)
-        aspect = pixel_aspect_of(original, image := self._resize(original))
-        histogram_figure(path, image, candidates, title=title, pixel_aspect=aspect, about=about)
+        histogram_figure(path, self._resize(original), candidates, title=title, original=original, about=about)
 
     def correct_candidates(self, query: int) -> list[Candidate]:
         """The first correct candidate, or the correct image that retrieval missed; empty if there is none."""
@@ -250,29 +269,29 @@ def localization_figure(
     query = resize(image, size, interpolation)
     place = f"no place ({prediction.reason})" if prediction.place is None else str(prediction.place)
     title, about = f"{_short(name)} -> {_short(place)}", {"image": name, "place": str(prediction.place)}
-    histogram_figure(path, query, [candidate], title=title, pixel_aspect=pixel_aspect_of(image, query), about=about)
+    histogram_figure(path, query, [candidate], title=title, original=image, about=about)
 
 
 def contact_sheet(path: Path, dataset: Dataset) -> None:
     """Write a figure of pairs, evenly spread over each sequence: a query, and the place that the ground truth names."""
-    each, pairs = max(2, -(-_PAIRS // len(dataset.sequences))), list[list[tuple[ImageFolder, int]]]()
+    each, cells = max(2, -(-_PAIRS // len(dataset.sequences))), list[tuple[ImageFolder, int] | None]()
     for sequence in dataset.sequences:
         for query in np.unique(np.linspace(0, len(sequence.images) - 1, each).round().astype(int)).tolist():
             place = None if sequence.truth is None else sequence.truth.place(query)
-            pairs.append([(sequence.images, query), *([] if place is None else [(dataset.database, place)])])
-    figure, axes = panels(2 * len(pairs), 3.2, 2.6)
+            cells += [(sequence.images, query), None if place is None else (dataset.database, place)]
+    figure, axes = panels(len(cells), 3.2, 2.6)
     figure.suptitle(f"{dataset.name}: query | the place that the ground truth names", fontsize=11, parse_math=False)
-    for panel in axes:
+    for panel, cell in zip(axes, cells, strict=True):
         panel.set_axis_off()
-    for number, pair in enumerate(pairs):
-        if len(pair) < 2:
-            axes[2 * number + 1].text(0.5, 0.5, "no place", ha="center")
-        for panel, (folder, row) in zip(axes[2 * number :], pair, strict=False):
-            panel.set_title(_short(f"{folder.root.name}/{folder.names[row]}"), fontsize=7, parse_math=False)
-            try:
-                image = Image.fromarray(folder.read(row))
-                image.thumbnail((_SIDE, _SIDE))
-                panel.imshow(image)
-            except InputError:
-                panel.text(0.5, 0.5, "cannot be read", ha="center")
+        if cell is None:
+            panel.text(0.5, 0.5, "no place", ha="center")
+            continue
+        folder, row = cell
+        panel.set_title(_short(f"{folder.root.name}/{folder.names[row]}"), fontsize=7, parse_math=False)
+        try:
+            image = Image.fromarray(folder.read(row))
+            image.thumbnail((_SIDE, _SIDE))
+            panel.imshow(image)
+        except InputError:
+            panel.text(0.5, 0.5, "cannot be read", ha="center")
     save_figure(figure, path, dpi=80)

@@ -1,8 +1,14 @@
-"""Pages of run folders, read from their files: of one run, of a search or a multirun, of several runs compared."""
+"""Pages of run folders, read from their files: of one run, of a search or a multirun, of several runs compared.
+
+A page is one HTML file that needs no network. Names of images may be anything: they are data, and all is escaped.
+"""
 
 import itertools
 import json
+from base64 import b64encode
 from collections.abc import Iterator, Mapping, Sequence
+from hashlib import sha256
+from io import BytesIO
 from pathlib import Path
 from typing import Any
 
@@ -11,52 +17,85 @@ from jaxtyping import Bool
 
 from mfvpr.datasets.datasets import MEANS
 from mfvpr.datasets.ground_truth import middle, threshold_words
+from mfvpr.datasets.image_reading import open_image
 from mfvpr.evaluation.confidence import PrecisionRecall
 from mfvpr.evaluation.rankings import RETRIEVAL
 from mfvpr.evaluation.statistics import Estimate, estimate, mcnemar, path_test
 from mfvpr.io.containers import reading
 from mfvpr.report.evaluations import sequence_folder
-from mfvpr.report.rendering import (
-    PAGE,
-    Chart,
-    Section,
-    bar_chart,
-    embed,
-    flat,
-    line_chart,
-    pictures,
-    values_table,
-    write_page,
-)
-from mfvpr.report.runs import LAST, file_names
-from mfvpr.report.tables import Table, format_estimate, format_interval, read_csv, read_table, table_of
+from mfvpr.report.figures import ABOUT
+from mfvpr.report.runs import LAST, Table, file_names, format_estimate, format_interval, read_csv, table_of
 from mfvpr.utils.errors import InputError
+from mfvpr.utils.files import require_replaceable, write_text
 
+# Jinja2 and plotly are imported where they are needed: the rest of the library does not depend on them.
+PAGE = "report.html"  # in a run folder
 MOST_PREDICTIONS = 5000  # rows of a table that a browser still sorts at once
+_MOST_PICTURES = 60
+_PICTURE_WIDTH, _QUALITY = 1000, 75  # px, of JPEG: some 60 kB each
+_POLICY = b"default-src 'none'; script-src "  # at the start of every page
+_TEMPLATES = Path(__file__).parent / "templates"
 _EXPECTED = "expected the run folder of an evaluation of this version"
 _NAMELESS = "folder"  # the default name of a data set of own folders
 _CURVE_POINTS = 200
 _POOLED = MEANS[-1]
-_WITH_TRUTH, _OF_SOME = ("table", "confidence", "precision_recall"), ("changes", "skipped")  # tables
 _OUTCOMES = {"1": "correct", "0": "incorrect", "": "best"}  # by `correct` of predictions
 _SEARCH_TABLES = {"rows": "All scores", "axes": "All settings", "jobs": "All jobs"}  # by a name in results.json
 _IN_TABLES = {"settings", "rows", "queries", "report", "jobs"}  # names in results.json
+
+
+def write_page(path: Path, template: str = "sections.html", **content: Any) -> None:
+    """Write one HTML file; the same bytes for the same values. An earlier page is replaced; InputError for other files.
+
+    Every page has a `title`, `words` below it, and `facts`, the most important values by name. sections.html has
+    `parts`, by title: the `words`, `links`, `text`, `images` and `tables` of each, as far as it has them. Links are
+    words and relative addresses, images `data:` URIs by name, and tables are by caption.
+    """
+    require_replaceable(path, _POLICY)
+    from jinja2 import Environment, FileSystemLoader, StrictUndefined
+    from markupsafe import Markup
+    from plotly.offline import get_plotlyjs
+
+    environment = Environment(loader=FileSystemLoader(_TEMPLATES), autoescape=True, undefined=StrictUndefined)
+    environment.trim_blocks = environment.lstrip_blocks = True
+    environment.filters["flat"] = flat
+    environment.policies["json.dumps_kwargs"] = {"sort_keys": True, "allow_nan": False}
+    scripts = [get_plotlyjs(), (_TEMPLATES / "script.js").read_text("utf-8")]
+    hashes = [b64encode(sha256(script.encode()).digest()).decode() for script in scripts]
+    text = environment.get_template(template).render(
+        {"recall": None, "charts": [], **content},
+        scripts=map(Markup, scripts),  # of this package and of plotly, as is the style
+        style=Markup((_TEMPLATES / "style.css").read_text("utf-8")),
+        hashes=" ".join(f"'sha256-{each}'" for each in hashes),
+    )
+    write_text(path, text)
+
+
+def flat(values: Mapping[str, Any]) -> Iterator[tuple[str, str]]:
+    """Nested values as (dotted name, text)."""
+    for name, value in values.items():
+        if isinstance(value, Mapping) and value:
+            yield from ((f"{name}.{inner}", text) for inner, text in flat(value))
+        else:
+            yield name, value if isinstance(value, str) else json.dumps(value, ensure_ascii=False)
+
+
+def embed(content: bytes, kind: str = "png") -> str:
+    """The content of an image file as a `data:` URI."""
+    return f"data:image/{kind};base64,{b64encode(content).decode()}"
 
 
 class Run:
     """The content of a run folder.
 
     Attributes:
-        results: rows of `results.json`; `common` is the first, for values that all share, such as the `description`.
-        about: the content of `run.json`.
-        tables: of CSV files, by name without suffix.
+        results: rows of `results.json`; `common` is the first, for values that all share. `about` is run.json.
+        tables: rows of CSV files, by name without suffix.
         systems: names in the order of the results; the `headline` decides.
         sequences: names; a single one without a name has the data set's.
-        parts: numbers of the sequences by name, and None by the name of all queries together.
-        thresholds: of a correct prediction, ascending; none without ground truth.
-        within: the middle threshold, as it stands behind R@K.
+        within: the middle of the `thresholds`, as it stands behind R@K; "" without ground truth.
         queries: names of the Q queries of all sequences along the path; none without ground truth.
-        sequence_of: numbers of their sequences `[Q]`.
+        sequence_of: names of their sequences `[Q]`.
         ranks: of their first correct candidates `[Q]` by system, 0 = no candidate is correct.
     """
 
@@ -67,35 +106,33 @@ class Run:
             self.results: list[dict[str, Any]] = _read_json(folder / LAST)
             self.about: dict[str, Any] = _read_json(folder / "run.json")
             self.common = self.results[0]
-            self.description, truth = self.common["description"], self.common["ground_truth"]
+            truth = self.common["ground_truth"]
             self.systems = list(dict.fromkeys(row["system"] for row in self.results))
             self.headline = next(row["system"] for row in self.results if row["decides"])
             sequences = dict.fromkeys(row.get("sequence", row["dataset"]) for row in self.results)
             self.sequences = [name for name in sequences if name not in MEANS]
-            self.parts = {name: number for number, name in enumerate(self.sequences)} | {_POOLED: None}
             self.thresholds: list[float] = truth.get("thresholds", [])
             self.within = threshold_words(truth["unit"], middle(self.thresholds)) if self.thresholds else ""
-            names = [*_WITH_TRUTH] if self.thresholds else []
-            names += [name for name in _OF_SOME if (folder / f"{name}.csv").exists()]
-            self.tables = {name: read_table(folder / f"{name}.csv") for name in names}
-            lines = list[tuple[int, dict[str, str]]]()
-            for number in range(len(self.sequences) if self.thresholds else 0):
+            names = ["table", "confidence", "precision_recall"] if self.thresholds else []
+            names += ["skipped"] if (folder / "skipped.csv").exists() else []
+            self.tables = {name: read_csv(folder / f"{name}.csv") for name in names}
+            lines = list[tuple[str, dict[str, str]]]()
+            for number, name in enumerate(self.sequences if self.thresholds else ()):
                 gains = read_csv(sequence_folder(folder, self.sequences, number) / "gains.csv")
-                lines += [(number, line) for line in gains]
+                lines += [(name, line) for line in gains]
             lines.sort(key=lambda line: int(line[1]["place"]))
-            self.queries = [line["query"] for _, line in lines]
-            self.sequence_of = np.array([number for number, _ in lines], int)
+            self.queries, self.sequence_of = [line["query"] for _, line in lines], np.array([name for name, _ in lines])
             ranks = {name: [line[f"{name} rank"] or 0 for _, line in lines] for name in self.systems if lines}
             self.ranks = {name: np.array(column, int) for name, column in ranks.items()}
 
-    def hits(self, system: str, k: int = 1, sequence: int | None = None) -> Bool[np.ndarray, " queries"]:
-        """Along the path, whether one of the first k candidates is correct; `sequence` None = of all."""
-        hits = (self.ranks[system] > 0) & (self.ranks[system] <= k)
-        return hits if sequence is None else hits[self.sequence_of == sequence]
+    def hits(self, system: str, k: int = 1) -> Bool[np.ndarray, " queries"]:
+        """Along the path, whether one of the first k candidates is correct."""
+        return (self.ranks[system] > 0) & (self.ranks[system] <= k)
 
-    def recall(self, system: str, sequence: int | None = None) -> Estimate:
-        """Recall at 1 and its 95 % interval."""
-        return estimate(self.hits(system, 1, sequence))
+    def recall(self, system: str, sequence: str = _POOLED) -> Estimate:
+        """Recall at 1 of a sequence, or of all queries, and its 95 % interval."""
+        hits = self.hits(system)
+        return estimate(hits if sequence == _POOLED else hits[self.sequence_of == sequence])
 
     def predictions(self) -> Iterator[dict[str, str]]:
         """The first candidates of all systems for each query that has one, those of the system that decides first.
@@ -114,6 +151,21 @@ class Run:
                     about = {"system": system, "sequence": sequence, "outcome": outcome, "first_correct": rank}
                     yield {"query": row["query"], "prediction": row["database"], "score": row["score"], **about}
 
+    def pictures(self) -> list[dict[str, Any]]:
+        """Figures of queries and their predictions, by their files; evenly chosen if there are many.
+
+        A picture has the values of the keywords `ABOUT`, its `source` as a `data:` URI, and its `size`, px.
+        """
+        paths, shown = sorted((self.folder / "figures").rglob("*_[0-9]*.png")), list[dict[str, Any]]()
+        for path in paths[:: max(1, -(-len(paths) // _MOST_PICTURES))]:
+            with open_image(path) as image:
+                image.load()
+                about, small, file = {name: str(image.info[name]) for name in ABOUT}, image.convert("RGB"), BytesIO()
+            small.thumbnail((_PICTURE_WIDTH, small.height))
+            small.save(file, "JPEG", quality=_QUALITY, optimize=True)
+            shown.append(about | {"source": embed(file.getvalue(), "jpeg"), "size": small.size})
+        return shown
+
 
 def _read_json(path: Path) -> Any:
     return json.loads(path.read_text("utf-8"))
@@ -128,21 +180,38 @@ def write_report(folder: Path, path: Path | None = None) -> Path:
         _write_search_page(folder, results, path)
         return path
     run = Run(folder)
-    sections, facts = list[Section](), {"decides": run.headline}
+    common, facts, recall = run.common, {"decides": run.headline}, dict[str, Any]()
     if run.queries:
-        sections += _recall_sections({"": run}, {name: (run, name) for name in run.systems})
+        recall = _recall({"": run}, {name: (run, name) for name in run.systems})
         for name in (run.headline, RETRIEVAL):
             facts[f"{name}, R@1{run.within}, %"] = format_estimate(run.recall(name))
-    if "changes" in run.tables:
-        words = "First predictions that the other queries of a drive change."
-        changes = Table(run.tables["changes"].header, run.tables["changes"].rows, text_columns=7)
-        sections.append(Section("sequence", "Sequences", words, tables={"Changed predictions": changes}))
-    facts["seconds in all"] = f"{sum(run.common['seconds'].values()):.1f}"
-    sections += [_predictions_section(run), _settings_section(run)]
-    title, dataset = run.common["dataset"], run.about["settings"]["dataset"]
+    facts["seconds in all"] = f"{sum(common['seconds'].values()):.1f}"
+    with reading(folder / LAST, mend=_EXPECTED):
+        pictures, predictions = run.pictures(), [*itertools.islice(run.predictions(), MOST_PREDICTIONS + 1)]
+    per_query = 1 / max(common["queries"], 1)
+    seconds = [[stage, f"{value:.3f}", f"{value * per_query:.4f}"] for stage, value in common["seconds"].items()]
+    made = {name: run.about.get(name) for name in ("command", "commit")}
+    made |= {name.replace("_", " "): common[name] for name in ("ground_truth", "data_fingerprint")}
+    skipped = run.tables.get("skipped", [])
+    title, dataset = common["dataset"], run.about["settings"]["dataset"]
     if title == _NAMELESS and isinstance(dataset.get("queries"), str):  # the ends of the paths of its folders
         title = " in ".join("/".join(Path(dataset[side]).parts[-2:]) for side in ("queries", "database"))
-    write_page(path, title=title, words=run.description, facts=facts, sections=sections)
+    write_page(
+        path,
+        "run.html",
+        title=title,
+        words=common["description"],
+        facts=facts,
+        pictures=pictures,
+        predictions=predictions[:MOST_PREDICTIONS],
+        is_cut=len(predictions) > MOST_PREDICTIONS,
+        seconds=Table(["stage", "seconds", "per query"], seconds),
+        run=run,
+        made=made,
+        systems={row["system"]: row["parameters"] for row in run.results},
+        skipped=skipped and table_of(skipped, [*skipped[0]]),
+        **recall,
+    )
     return path
 
 
@@ -158,24 +227,27 @@ def write_comparison(folders: Sequence[Path], path: Path) -> None:
     runs = dict(zip(labels, map(Run, folders), strict=True))
     overview, facts, settings = [], {}, {}
     for label, run in runs.items():
-        overview.append({"run": label, "data set": run.common["dataset"], "decides": run.headline})
-        overview[-1]["what was evaluated"] = run.description
+        overview.append([label, run.common["dataset"], run.headline, run.common["description"]])
         if run.queries:
             facts[f"{label}, R@1{run.within}, %"] = format_estimate(run.recall(run.headline))
         about = {name: run.about.get(name) for name in ("command", "commit", "settings", "ground_truth")}
         about |= {name: run.common[name] for name in ("data_fingerprint", "versions", "seconds")}
         settings[label] = dict(flat(about))
-    sections = [Section("runs", "Runs", tables={"Runs": table_of(overview, [*overview[0]])})]
+    header, recall = ["run", "data set", "decides", "what was evaluated"], dict[str, Any]()
     if known := {label: run for label, run in runs.items() if run.queries}:
-        curves = {f"{label}: {run.headline}": (run, run.headline) for label, run in known.items()}
-        sections += _recall_sections(known, curves)
+        recall = _recall(known, {f"{label}: {run.headline}": (run, run.headline) for label, run in known.items()})
     names = dict.fromkeys(name for values in settings.values() for name in values)
     rows = [[name, *(values.get(name, "") for values in settings.values())] for name in names]
-    differing = Table(["name", *settings], [row for row in rows if len({*row[1:]}) > 1], 1 + len(settings))
-    sections.append(Section("settings", "Settings and versions", tables={"What differs": differing}))
-    words = "The systems that decide, beside each other; each run has a page of its own."
-    title = f"{', '.join(dict.fromkeys(run.common['dataset'] for run in runs.values()))}: {len(runs)} runs compared"
-    write_page(path, title=title, words=words, facts=facts, sections=sections)
+    write_page(
+        path,
+        "comparison.html",
+        title=f"{', '.join(dict.fromkeys(run.common['dataset'] for run in runs.values()))}: {len(runs)} runs compared",
+        words="The systems that decide, beside each other; each run has a page of its own.",
+        facts=facts,
+        runs=Table(header, overview, text_columns=4),
+        differing=Table(["name", *settings], [row for row in rows if len({*row[1:]}) > 1], 1 + len(settings)),
+        **recall,
+    )
 
 
 def _write_search_page(folder: Path, results: Mapping[str, Any], path: Path) -> None:
@@ -184,50 +256,49 @@ def _write_search_page(folder: Path, results: Mapping[str, Any], path: Path) -> 
         [caption] = [caption for name, caption in _SEARCH_TABLES.items() if name in results]
         heading = (folder / "table.md").read_text("utf-8").splitlines()[0]
         summary = (folder / "summary.txt").read_text("utf-8") if (folder / "summary.txt").exists() else ""
-        figures = {file.stem: embed(file) for file in sorted((folder / "figures").glob("*.png"))}
-        tables = {caption: read_table(folder / "table.csv")}
-    about = values_table({name: value for name, value in results.items() if name not in _IN_TABLES})
+        figures = {file.stem: embed(file.read_bytes()) for file in sorted((folder / "figures").glob("*.png"))}
+        rows = read_csv(folder / "table.csv")
+        tables = {caption: table_of(rows, [*rows[0]][:1])}
     title, _, words = heading.partition(": ")
-    text = summary.removeprefix(heading).strip()
-    sections = [
-        Section("results", "Results", text=text, images=figures, tables=tables),
-        Section("settings", "Settings and versions", tables={"Run": about}),
-    ]
-    write_page(path, title=title, words=words, facts={}, sections=sections)
+    settings = {name: value for name, value in results.items() if name not in _IN_TABLES}
+    found = {"text": summary.removeprefix(heading).strip(), "images": figures, "tables": tables}
+    parts = {"Results": found, "Settings and versions": {"tables": {"Run": settings}}}
+    write_page(path, title=title, words=words, facts={}, parts=parts)
 
-
-# --- recall of runs with ground truth ----------------------------------------------------------------------------
 
 Curves = Mapping[str, tuple[Run, str]]  # a run and one of its systems, by the name of their curve
+Chart = dict[str, Any]  # for script.js: points (x, y in %) by the name of their curve, or bars by that of their group
 
 
-def _recall_sections(runs: Mapping[str, Run], curves: Curves) -> list[Section]:
-    """Recall of all systems of runs by name; of the curves with intervals, charts, and tests of every two."""
-    rows, tables = list[dict[str, str]](), dict[str, Table]()
+def _recall(runs: Mapping[str, Run], curves: Curves) -> dict[str, Any]:
+    """Content of recall.html: of all systems of runs by name; of the curves, charts, and tests of every two."""
+    rows = list[dict[str, str]]()
     groups = {"recall": {name: run.recall(system) for name, (run, system) in curves.items()}}
     for label, run in runs.items():
-        for cells in run.tables["table"].rows:
-            row = dict(zip(run.tables["table"].header, cells, strict=True))
-            if (sequence := row.get("sequence", _POOLED)) in run.parts:  # the plain mean has no interval
-                row[f"R@1{run.within}, 95 %"] = format_interval(run.recall(row["system"], run.parts[sequence]).interval)
+        for row in run.tables["table"]:
+            if (sequence := row.get("sequence", _POOLED)) != MEANS[0]:  # the plain mean has no interval
+                row[f"R@1{run.within}, 95 %"] = format_interval(run.recall(row["system"], sequence).interval)
             rows.append({"run": label} | row if label else row)
-        if run.tables["confidence"].rows:
-            tables["Confidence of top predictions, in %" + f": {label}" * bool(label)] = run.tables["confidence"]
         if len(run.sequences) > 1 and len(runs) == 1:
-            groups = {name: {part: run.recall(name, run.parts[part]) for part in run.parts} for name in curves}
-    bars = bar_chart("intervals", "Recall at 1, with intervals", groups, axis="recall at 1, %")
-    words = "In %, at the middle tolerance. The 95 % intervals are wider if neighboring queries fail together."
-    recall = {"Recall of every system": table_of(rows, ("run", "system", "sequence"))}
-    charts = [bars, *_tolerance_chart(curves), _depths_chart(curves)]
-    precision = _precision_charts(curves, "score") + _precision_charts(curves, "confidence")
-    about = (
-        "AP: average precision. R@100P: recall at 100 % precision. ECE: expected calibration error of the confidence."
-    )
-    return [
-        Section("recall", "Recall", words, charts, recall),
-        _pairs_section(curves),
-        Section("confidence", "Precision and recall", about, precision, tables),
+            groups = {name: {part: run.recall(name, part) for part in (*run.sequences, _POOLED)} for name in curves}
+    bars = {
+        name: [(member, 100 * bar.recall, [100 * end for end in bar.interval]) for member, bar in group.items()]
+        for name, group in groups.items()
+    }
+    intervals = {"name": "intervals", "title": "Recall at 1, with intervals", "axes": ("recall at 1, %", "")}
+    confidences = {label: run.tables["confidence"] for label, run in runs.items()}
+    charts = [
+        intervals | {"scale": "share", "data": [*bars.items()]},
+        _tolerance_chart(curves),
+        _depths_chart(curves),
+        *(_precision_chart(curves, by) for by in ("score", "confidence")),
     ]
+    return {
+        "recall": table_of(rows, ("run", "system", "sequence")),
+        "confidences": {label: table_of(table, ["system"]) for label, table in confidences.items() if table},
+        "charts": [chart for chart in charts if chart["data"]],
+        **_differences(curves),
+    }
 
 
 def _depths_chart(curves: Curves) -> Chart:
@@ -237,12 +308,11 @@ def _depths_chart(curves: Curves) -> Chart:
         largest = max(run.common["candidates"], 1)
         depths = np.unique(np.geomspace(1, largest, _CURVE_POINTS).round().astype(int)).tolist()
         points[name] = [(k, 100 * float(run.hits(system, k).mean())) for k in depths]
-    return line_chart(
-        "depths", "Recall over K", points, axes=("K, the first candidates", "recall at K, %"), scale="log"
-    )
+    axes = "K, the first candidates", "recall at K, %"
+    return {"name": "depths", "title": "Recall over K", "axes": axes, "scale": "log", "data": [*points.items()]}
 
 
-def _tolerance_chart(curves: Curves) -> list[Chart]:
+def _tolerance_chart(curves: Curves) -> Chart:
     """Recall of all queries over the threshold, of the runs with several thresholds in the unit of the first."""
     points, (run, _) = dict[str, list[tuple[float, float]]](), next(iter(curves.values()))
     unit, k = run.common["ground_truth"]["unit"], min(run.common["recall_at"], key=int)
@@ -252,81 +322,41 @@ def _tolerance_chart(curves: Curves) -> list[Chart]:
             recalls = [row["recall_at"][k] for row in rows if row.get("sequence", _POOLED) == _POOLED]
             points[name] = [(at, 100 * recall) for at, recall in zip(run.thresholds, recalls, strict=True)]
     axes = f"tolerance, {unit}", f"recall at {k}, %"
-    return [line_chart("tolerances", "Recall over tolerance", points, axes=axes, scale="linear")] if points else []
+    chart = {"name": "tolerances", "title": "Recall over tolerance", "axes": axes}
+    return chart | {"scale": "linear", "data": [*points.items()]}
 
 
-def _precision_charts(curves: Curves, by: str) -> list[Chart]:
+def _precision_chart(curves: Curves, by: str) -> Chart:
     """Precision against recall, if the runs have them; names of curves have their average precision."""
     points = {}
     for name, (run, system) in curves.items():
-        rows = [row[2:] for row in run.tables["precision_recall"].rows if row[:2] == [system, by]]
+        rows = [row for row in run.tables["precision_recall"] if (row["system"], row["by"]) == (system, by)]
         if rows:
-            curve = PrecisionRecall(*np.array(rows, float).T)
+            curve = PrecisionRecall(*np.array([[*row.values()][2:] for row in rows], float).T)
             shown = np.unique(np.linspace(0, len(rows) - 1, _CURVE_POINTS).round().astype(int))
             pairs = np.stack([curve.recall, curve.precision], axis=1)[shown]
             points[f"{name}: AP {100 * curve.average_precision:.1f}"] = (100 * pairs).round(3).tolist()
     axes = "recall of queries with a correct image, %", "precision, %"
-    title = f"Precision and recall by {by}"
-    return [line_chart(f"precision-{by}", title, points, axes=axes, scale="percent")] if points else []
+    chart = {"name": f"precision-{by}", "title": f"Precision and recall by {by}", "axes": axes}
+    return chart | {"scale": "percent", "data": [*points.items()]}
 
 
-def _pairs_section(curves: Curves) -> Section:
+def _differences(curves: Curves) -> dict[str, Table]:
     """Tests of every two curves, query by query, and the pairs that cannot be compared."""
     rows, incomparable = [], []
     for (name, (run, system)), (other, (second, other_system)) in itertools.combinations(curves.items(), 2):
-        if reason := _incomparable_reason(run, second):
-            incomparable.append([name, other, reason])
+        differing = {
+            "other images": run.common["data_fingerprint"] != second.common["data_fingerprint"],
+            "another ground truth": run.common["ground_truth"] != second.common["ground_truth"],
+            "other queries": (run.queries, run.sequences) != (second.queries, second.sequences),
+        }
+        if any(differing.values()):
+            incomparable.append([name, other, next(words for words, differs in differing.items() if differs)])
             continue
         hits = run.hits(system), second.hits(other_system)
         test, path = mcnemar(*hits), path_test(*hits)
         numbers = (f"{value:.2g}" for value in (test.p_value, *path))
         rows.append([name, other, str(test.only_first), str(test.only_second), *numbers])
-    words = (
-        "How many queries only one of two predicts correctly, and how probable that is if neither is better, by "
-        "McNemar's exact test, which takes queries for independent, and by a test along the path."
-    )
     header = ["system", "other", "only system", "only other", "McNemar p", "queries worth one", "p along the path"]
-    tables = {"Every two of the same queries": Table(header, rows, text_columns=2)} if rows else {}
-    if incomparable:
-        tables["Not comparable query by query"] = Table(["run", "other", "why"], incomparable, 3)
-    return Section("differences", "Differences", words, tables=tables)
-
-
-def _incomparable_reason(first: Run, second: Run) -> str | None:
-    """The reason that two runs with ground truth cannot be compared query by query; None = they can."""
-    if first.common["data_fingerprint"] != second.common["data_fingerprint"]:
-        return "other images"
-    if first.common["ground_truth"] != second.common["ground_truth"]:
-        return "another ground truth"
-    same = first.queries == second.queries and first.sequences == second.sequences
-    return None if same else "other queries"
-
-
-# --- predictions and settings of a run ---------------------------------------------------------------------------
-
-
-def _predictions_section(run: Run) -> Section:
-    with reading(run.folder / LAST, mend=_EXPECTED):
-        images, predictions = pictures(run.folder), [*itertools.islice(run.predictions(), MOST_PREDICTIONS + 1)]
-    words = "Query and top prediction with their heaviest matches, and the histogram of their shifts. An incorrect "
-    words += "prediction has the correct image below it. The table has the queries without a picture, too."
-    if len(predictions) > MOST_PREDICTIONS:
-        words += f" It has the first {MOST_PREDICTIONS}; the others are in the folder `predictions` of the run."
-    return Section("predictions", "Predictions", words, pictures=images, predictions=predictions[:MOST_PREDICTIONS])
-
-
-def _settings_section(run: Run) -> Section:
-    common, queries = run.common, max(run.common["queries"], 1)
-    about = {name: run.about.get(name) for name in ("command", "commit")}
-    about |= {name.replace("_", " "): common[name] for name in ("ground_truth", "data_fingerprint")}
-    seconds = [[stage, f"{value:.3f}", f"{value / queries:.4f}"] for stage, value in common["seconds"].items()]
-    tables = {
-        "Seconds, without what the cache had already": Table(["stage", "seconds", "per query"], seconds),
-        "Run": values_table(about),
-        "Settings": values_table(run.about["settings"]),
-        "Versions": values_table(common["versions"]),
-        "Systems": values_table({row["system"]: row["parameters"] for row in run.results}),
-    }
-    if skipped := run.tables.get("skipped"):
-        tables["Images that could not be used"] = Table(skipped.header, skipped.rows, 3)
-    return Section("settings", "Seconds, settings and versions", tables=tables)
+    reasons = Table(["run", "other", "why"], incomparable, text_columns=3)
+    return {"differences": Table(header, rows, text_columns=2), "incomparable": reasons}

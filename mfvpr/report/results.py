@@ -1,8 +1,6 @@
-"""Evaluation in one call, and its result: tables, predictions, run folders and a page.
+"""Evaluation in one call, and its result: tables, predictions, run folders and a page."""
 
-`mfvpr.evaluation.rank_dataset` ranks; this module reports.
-"""
-
+import itertools
 import math
 import tempfile
 from collections.abc import Mapping, Sequence
@@ -17,10 +15,8 @@ from mfvpr.evaluation.system import System
 from mfvpr.report.evaluations import EvaluationReport, recall_table
 from mfvpr.report.pages import write_comparison
 from mfvpr.report.pages import write_report as write_page
-from mfvpr.report.prediction_files import CandidateLayout, write_candidates
-from mfvpr.report.run_files import save_run
-from mfvpr.report.runs import claim_run_folder, file_names, write_table
-from mfvpr.report.tables import Table, data_frame
+from mfvpr.report.run_files import CandidateLayout, save_run, write_candidates
+from mfvpr.report.runs import Table, claim_run_folder, data_frame, file_names, write_table
 from mfvpr.storage.feature_cache import FeatureCache
 from mfvpr.utils.errors import InputError
 from mfvpr.utils.runtime import Runtime
@@ -32,18 +28,15 @@ Thresholds = Sequence[float] | None
 
 
 class TopPrediction(NamedTuple):
-    """The first candidate of a query, by names; without a candidate, it is None and its score NaN.
-
-    `is_correct` is that within the middle threshold, and None without ground truth.
-    """
+    """The first candidate of a query, by names."""
 
     dataset: str
     system: str
     sequence: str
     query: str
-    prediction: str | None
-    score: float
-    is_correct: bool | None
+    prediction: str | None  # None = no candidate
+    score: float  # NaN without a candidate
+    is_correct: bool | None  # within the middle threshold; None without ground truth
 
 
 def evaluate(
@@ -64,8 +57,7 @@ def evaluate(
         cache: where all systems keep features, and with a folder also matches; None = features in memory.
         runtime: devices, memory, progress and messages; None = those of the cache.
 
-    Raises:
-        InputError: images or features that cannot be used, or an invalid result of an extractor, retrieval or scorer.
+    An `InputError` for images or features that cannot be used, or for an invalid result of a part of a system.
     """
     cache = FeatureCache() if cache is None else cache
     if not isinstance(cache, FeatureCache):
@@ -74,9 +66,9 @@ def evaluate(
     systems = system if isinstance(system, Mapping) else {system.headline: system}
     if not datasets or not systems:
         raise InputError("evaluate: expected at least one data set and one system, got none")
-    pairs = [(dataset_name, system_name) for dataset_name in datasets for system_name in systems]
-    ranked = [rank_dataset(datasets[a], systems[b], cache=cache, runtime=runtime) for a, b in pairs]
-    return Result(dict(zip(pairs, ranked, strict=True)), cache)
+    pairs = itertools.product(datasets, systems)
+    parts = {(a, b): rank_dataset(datasets[a], systems[b], cache=cache, runtime=runtime) for a, b in pairs}
+    return Result(parts, cache)
 
 
 @dataclass(frozen=True, repr=False)
@@ -88,14 +80,10 @@ class Result:
 
     `thresholds` are largest distances of a correct prediction in the unit of the ground truth, `ks` depths of recall.
     The defaults are those of the programs: 1, 2 and 5 frames or 25 m, and 1, 5 and 10.
-
-    Attributes:
-        parts: by names of the data set and of the system; a system without a name has that of its final score.
-        cache: of the evaluation.
     """
 
-    parts: Mapping[tuple[str, str], RankedDataset]
-    cache: FeatureCache
+    parts: Mapping[tuple[str, str], RankedDataset]  # by names of the data set, and of the system or its final score
+    cache: FeatureCache  # of the evaluation
 
     def __repr__(self) -> str:
         return f"Result({'; '.join(map(', '.join, self._names))})"
@@ -137,13 +125,12 @@ class Result:
         """The top prediction of every query, by the final score that decides of each system."""
         predictions = []
         for names, report in self._reports(None, KS):
-            database = report.ranked.dataset.database.names
-            for place, ranked in enumerate(report.ranked.systems[report.headline]):
-                sequence, correct = report.sequences[place], report.is_correct(report.headline, place)
-                for query, (name, row) in enumerate(zip(sequence.images.names, ranked.rows[:, 0], strict=True)):
-                    top = (database[row], float(ranked.scores[query, 0])) if row >= 0 else (None, math.nan)
-                    is_correct = None if correct is None else bool(correct[query, 0])
-                    predictions.append(TopPrediction(*names, sequence.name, name, *top, is_correct))
+            database, ranked = report.ranked.dataset.database.names, report.rankings[report.headline]
+            hits = report.hits(report.headline).tolist() if report.thresholds else [None] * len(report.queries)
+            firsts = ranked.rows[:, 0].tolist(), ranked.scores[:, 0].tolist()
+            for (sequence, query), row, score, is_correct in zip(report.queries, *firsts, hits, strict=True):
+                top = (database[row], score) if row >= 0 else (None, math.nan)
+                predictions.append(TopPrediction(*names, sequence.name, query, *top, is_correct))
         return predictions
 
     def save(self, folder: Path | str, thresholds: Thresholds = None, ks: Sequence[int] = KS) -> list[Path]:
@@ -170,10 +157,11 @@ class Result:
         report = EvaluationReport(self.only)
         files = file_names([sequence.name for sequence in report.sequences])
         for place, sequence in enumerate(report.sequences):
+            ranked, part = self.only.systems[report.headline][place], report.parts[place]
             target = Path(path) / files[sequence.name] if len(files) > 1 else Path(path)
-            shortlist = report.ranked.systems[report.headline][place].shortlist
+            positives = None if report.positives is None else report.positives.take(part)
             sides = sequence.images, report.ranked.dataset.database
-            write_candidates(target, shortlist, *sides, layout, report.positives[place])
+            write_candidates(target, ranked.shortlist, *sides, layout, positives)
 
     def write_report(self, path: Path | str, thresholds: Thresholds = None, ks: Sequence[int] = KS) -> None:
         """Write the page of `mfvpr report`; of several data sets or systems, beside each other."""

@@ -11,7 +11,7 @@ from mfvpr.core.types import Shortlist
 from mfvpr.datasets.datasets import ImageFolder, QuerySequence
 from mfvpr.datasets.positives import Positives
 from mfvpr.features.extractor import Aggregated, Extractor, describe_folder
-from mfvpr.features.whitening import Whitening, WindowExtractor, WindowFitting, origin
+from mfvpr.features.whitening import Whitening, WindowFitting, origin
 from mfvpr.retrieval.search import EXACT, Search
 from mfvpr.storage.cache_files import CacheFiles
 from mfvpr.storage.feature_cache import FeatureCache
@@ -130,8 +130,7 @@ def fit_to_database(tool: Tool, database: ImageFolder, cache: FeatureCache) -> T
     The cache stores learned parts, by the images' content and all settings. Parts that are learned already stay the
     same, even if from another database. Images that cannot be read or are too few raise an `InputError`.
     """
-    if isinstance(tool, WindowExtractor) and isinstance(tool.whitening, WindowFitting):
-        fitting = tool.whitening
+    if isinstance(fitting := getattr(tool, "whitening", None), WindowFitting):
         whitening = cache.recipes.once("whitening", lambda: _whitening(tool, fitting, database, cache), database, tool)
         return replace(tool, whitening=whitening)  # pyright: ignore[reportArgumentType, reportCallIssue, reportReturnType]
     return with_parts(tool, lambda part: fit_to_database(part, database, cache))
@@ -146,15 +145,13 @@ def with_parts(whole: Any, change: Callable[[Any], Any]) -> Any:
     return replace(whole, **changed) if changed else whole
 
 
-def whitening_recipe(extractor: WindowExtractor, fitting: WindowFitting, cache: FeatureCache) -> dict[str, Any]:
+def whitening_recipe(extractor: Any, fitting: WindowFitting, cache: FeatureCache) -> dict[str, Any]:
     """Recipe of a whitening but for the database: network and its input, windows, and samples."""
     parts = {"windows": cache.recipes.of(extractor.windows), "whitening": cache.recipes.of(fitting)}
     return cache.recipes.of_features(extractor.maps) | parts
 
 
-def _whitening(
-    extractor: WindowExtractor, fitting: WindowFitting, database: ImageFolder, cache: FeatureCache
-) -> Whitening:
+def _whitening(extractor: Any, fitting: WindowFitting, database: ImageFolder, cache: FeatureCache) -> Whitening:
     """Whitening from the cache, learned and stored there if it is missing."""
     name, own_origin = f"{type(extractor).__name__}-whitening", origin(extractor)
 

@@ -10,7 +10,7 @@ import pytest
 from scipy.optimize import least_squares
 
 from mfvpr import Homography, score_candidates
-from mfvpr.baselines import planes
+from mfvpr.baselines import homography
 from mfvpr.utils import NoGradientError
 from mfvpr.utils.numerics import masked
 from tests import ransac_oracle
@@ -58,7 +58,7 @@ def test_it_is_the_search_sample_by_sample_in_double_precision(count, share, thr
         matches = pair([seed, count], count, share)
         got = estimate(Homography(threshold, 500.0, seed=seed), matches)
         points = np.where(matches.mask[:, None], np.concatenate([matches.points1, matches.points0], axis=-1), 0)
-        order = np.asarray(planes.canonical_order(points, matches.mask))[:count]
+        order = np.asarray(homography.canonical_order(points, matches.mask))[:count]
         inliers, samples, errors = ransac_oracle.estimate(
             points[order, :2], points[order, 2:], threshold=threshold, max_iterations=500, seed=seed
         )
@@ -69,7 +69,7 @@ def test_it_is_the_search_sample_by_sample_in_double_precision(count, share, thr
 
 
 def test_draws_are_distinct_and_every_set_is_as_likely():
-    drawn = np.sort(np.asarray(planes.draw_four(jax.random.key(1), 0, np.int32(6))), axis=0)
+    drawn = np.sort(np.asarray(homography.draw_four(jax.random.key(1), 0, np.int32(6))), axis=0)
     assert (np.diff(drawn, axis=0) > 0).all()
     assert (drawn.min(), drawn.max()) == (0, 5)
     _, counts = np.unique(drawn, axis=1, return_counts=True)

@@ -25,7 +25,7 @@ from mfvpr.baselines.learned_weight import (
 from mfvpr.core.weights import WEIGHTS
 from mfvpr.systems.assembly import scorers
 from tests.builders import random_matches
-from tests.programs import results, shared, small, typed
+from tests.programs import shared, small, typed
 
 pytestmark = pytest.mark.thorough
 
@@ -100,28 +100,6 @@ def run(monkeypatch, capsys, tmp_path_factory):
     """Run a program on small data: its exit code, stdout and stderr."""
     settings = small(shared(tmp_path_factory))
     return lambda program, *options: typed(monkeypatch, capsys, program, *settings, *options)
-
-
-def weighted_histogram(weight, out):
-    return "figures=0", "scorer=histogram", f"scorer.weight={weight}", f"out={out}"
-
-
-@pytest.mark.slow
-def test_programs_rank_by_a_file_as_by_the_equal_word(run, file, tmp_path):
-    constant = tmp_path / "constant.json"
-    write_weight(constant, replace(WEIGHT, output=np.zeros(3, np.float32)), {})  # 1 for every match
-    axis = f"grid.weight=[unit,{constant},{file}]"
-    code, _, stderr = run("sweep", "scorer=sum", axis, f"out={tmp_path}/sweep")
-    assert code == 0, stderr
-    unit, same = (json.dumps(row["recall_at"]) for row in results(tmp_path / "sweep")["settings"][:2])
-    assert unit == same
-    rankings = []
-    for number, name in enumerate(("unit", constant, file)):
-        code, _, stderr = run("evaluate", *weighted_histogram(name, tmp_path / str(number)))
-        assert code == 0, stderr
-        lines = (tmp_path / str(number) / "predictions" / "histogram.csv").read_text().splitlines()
-        rankings.append([line.split(",")[:3] for line in lines])
-    assert rankings[0] == rankings[1] != rankings[2]
 
 
 def test_the_error_for_an_unknown_weight_is_one_line(run, tmp_path):

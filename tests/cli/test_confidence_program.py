@@ -91,6 +91,8 @@ def test_below_the_threshold_the_answer_is_no_place(evaluate, confidence):
     assert counts == [(correct & ~refused).sum(), (~correct & ~refused).sum(), refused.sum(), (correct & refused).sum()]
     predictions = csv_rows(out / "predictions.csv")
     none = [line for line in predictions if line["database"] == "no place"]
+    shifted = [(line["query"], line["prediction"]) for line in csv_rows(out / "shifts.csv")]
+    assert shifted == [(line["query"], line["prediction"]) for line in top if line["prediction"] != "no place"]
     refusing = {line["query"] for line in none}
     assert refusing == {line["query"] for line in top if line["prediction"] == "no place"}
     rest = [line for line in csv_rows(out / "predictions" / "histogram.csv") if line["query"] not in refusing]

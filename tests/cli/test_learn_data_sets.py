@@ -41,7 +41,7 @@ def learned(root, streets, tmp_path_factory):
     out = tmp_path_factory.mktemp("learned")
     common = (*SHORT, f"report=[{streets[2]}]")
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(learning.comparisons, "comparison_figures", lambda *_: [])
+        patch.setattr(learning.searches, "comparison_figures", lambda *_: [])
         learning.learn(settings_of(*small(root), *common, f"also=[{streets[1]}]", f"out={out}/out", config="learn"))
     return out, results(out / "out")
 

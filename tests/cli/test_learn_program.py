@@ -26,7 +26,7 @@ WIDEST = 1  # frames
 @pytest.fixture(scope="session")
 def learn(root):
     """Learns into a folder."""
-    return job_of(root, "learn", learning.learn, (learning.comparisons, "comparison_figures"))
+    return job_of(root, "learn", learning.learn, (learning.searches, "comparison_figures"))
 
 
 @pytest.fixture(scope="session")
@@ -154,7 +154,7 @@ def test_an_interrupted_learning_goes_on_to_the_same_end(root, learn, learned, t
 
 def test_whatever_changes_the_result_changes_the_checkpoint(root, untrained, tmp_path, monkeypatch):
     """Else one training would go on with what another one left."""
-    monkeypatch.setattr(learning.comparisons, "comparison_figures", lambda *_: [])
+    monkeypatch.setattr(learning.searches, "comparison_figures", lambda *_: [])
     shifted = tmp_path / "shifted.csv"
     shifted.write_text("query,database\n" + "".join(f"{row},{(row + 1) % QUERIES}\n" for row in range(QUERIES)))
     changes = [

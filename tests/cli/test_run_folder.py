@@ -120,7 +120,7 @@ def test_a_run_says_how_it_was_made(root, tmp_path, monkeypatch, succeed):
 def test_a_wrong_figure_has_the_right_image_below(evaluated, outcome):
     assert len([*(evaluated / "figures").glob("*_0*.png")]) == 4
     page = page_of(outcome)
-    [ranked], correct = outcome.report.ranked.systems["histogram"], outcome.report.is_correct("histogram", 0)
+    [ranked], correct = outcome.report.ranked.systems["histogram"], outcome.report.correct["histogram"]
     query_by_case = {bool(correct[query].any()): query for query in np.flatnonzero(~correct[:, 0])}
     names = outcome.report.ranked.dataset.database.names
     query = query_by_case[True]
@@ -144,7 +144,7 @@ def page_of(outcome, **changes):
 
 def test_what_does_not_count_is_never_shown_as_right(outcome):
     """If the nearest image is excluded, the page shows another correct image, or none."""
-    correct = outcome.report.is_correct("histogram", 0)
+    correct = outcome.report.correct["histogram"]
     query = int(np.flatnonzero(~correct.any(axis=1))[0])
     names, truth = outcome.report.ranked.dataset.database.names, outcome.report.ranked.dataset.truth
     excluded = np.zeros((len(outcome.report.ranked.dataset.queries), len(names)), bool)
@@ -154,7 +154,7 @@ def test_what_does_not_count_is_never_shown_as_right(outcome):
         page = page_of(outcome, truth=AllowedTruth(truth, Positives(excluded)))
         return [prediction.caption for prediction in page.correct_candidates(query)]
 
-    other = int(np.argmax(outcome.report.positives[0].dense()[query] & ~excluded[query]))
+    other = int(np.argmax(outcome.report.positives.dense()[query] & ~excluded[query]))
     assert predictions(excluded) == [f"correct: {names[other]}, not among the 3 candidates"]
     assert predictions(np.ones_like(excluded)) == []
 

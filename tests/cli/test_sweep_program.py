@@ -20,7 +20,7 @@ SWEEP = sys.modules["mfvpr.tuning.sweeps"]
 @pytest.fixture(scope="session")
 def sweep(root):
     """Sweeps into a folder."""
-    return job_of(root, "sweep", sweeping.sweep_program, (sweeping.sweeps, "sweep_figures"))
+    return job_of(root, "sweep", sweeping.sweep_program, (sweeping.searches, "sweep_figures"))
 
 
 GRID = ("grid.sigma=[10,22.5]", "grid.weight=[fs,unit]", "grid.c=[0,2]", "fusion.c=2")

@@ -18,7 +18,7 @@ from mfvpr.features import Aggregated, VladFitting
 from mfvpr.io import write_features, write_global_descriptors, write_shortlist
 from mfvpr.report.evaluations import EvaluationReport, recall_table
 from mfvpr.report.run_files import write_gains
-from mfvpr.report.tables import read_table
+from mfvpr.report.runs import read_csv
 from mfvpr.retrieval import DescriptorFiles, FeatureFiles, Retrieval, ShortlistFiles
 from mfvpr.retrieval.precomputed import File
 from mfvpr.storage import FeatureCache
@@ -77,10 +77,9 @@ def test_sequences_are_evaluated_by_themselves_with_their_means(several, result,
     assert list(map(len, gains)) == [4, 8]
     places = [line.split(",")[1] for lines in gains for line in lines[1:]]
     assert places == list(map(str, range(10)))  # the two ends of one path, so that tests know what is next to what
-    hits = {
-        name: np.concatenate([evaluation.is_correct(name, place)[:, 0] for place in (0, 1)]) for name in parts.systems
-    }
-    for first, second, only_first, _, _, *path in read_table(tmp_path / "differences.csv").rows:
+    hits = {name: evaluation.hits(name) for name in parts.systems}
+    for line in read_csv(tmp_path / "differences.csv"):
+        first, second, only_first, _, _, *path = line.values()
         assert int(only_first) == (hits[first] > hits[second]).sum()
         assert [float(value) for value in path] == pytest.approx(path_test(hits[first], hits[second]), rel=1e-6)
 

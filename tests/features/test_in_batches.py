@@ -49,18 +49,6 @@ def test_two_images_run_at_the_same_time():
     assert network.in_batches(program, IMAGES[:5], 8) == IMAGES[:5, 0, 0, 0].tolist()
 
 
-@pytest.mark.parametrize("error", [ValueError, StopIteration])
-@pytest.mark.parametrize(("bad", "count"), [(0, 1), (1, 2), (5, 7)])
-def test_an_error_of_the_network_is_not_lost(bad, count, error):
-    def program(batch):
-        if batch[0, 0, 0, 0] == IMAGES[bad, 0, 0, 0]:
-            raise error
-        return batch[:, 0]
-
-    with pytest.raises((error, RuntimeError)):  # threads turn StopIteration into RuntimeError
-        network.in_batches(program, IMAGES[:count], 8)
-
-
 def test_settings_of_the_caller_hold_for_all_images(program):
     with jax.enable_x64(True):
         assert [total.dtype for total, _ in network.in_batches(program, IMAGES, 8)] == [np.float64] * 7

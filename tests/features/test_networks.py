@@ -99,17 +99,13 @@ def test_lightglue_matches_the_street_and_its_store_is_its_own(evaluate, real_we
     ("arguments", "words"),
     [
         (["features=d2net"], "d2_tf: not installed in NOWHERE; "),
-        (["features=aliked"], "mfvpr weights download aliked-n16"),
         (["retrieval=mixvpr"], "weights none stated"),
         (["features=d2net", "features.weights=mixvpr_512"], "features.weights=mixvpr_512: expected weights of d2net"),
         (["retrieval=mixvpr", "retrieval.image_size=[224,224]"], "image_size=[224, 224]: expected [320, 320]"),
-        (["retrieval=ssm", "retrieval.image_size=[336,336]"], "image_size=[336, 336]: expected [224, 224]"),
         (["matching=lightglue"], "mfvpr weights download aliked_lightglue"),
         (["retrieval=same"], "retrieval=same: expected features with a global descriptor"),
         (["features=aliked", "features.contrast_threshold=2"], "Could not override 'features.contrast_threshold'"),
-        (["system=mix_hist_20"], "Could not find 'system/mix_hist_20'"),
         (["features.interpolation=torch_bilinear"], "SIFT takes whole numbers"),
-        (["features=d2net", "features.preprocessing=vgg"], "expected one of caffe, torch"),
     ],
 )
 def test_mistakes_are_one_line(evaluate, arguments, words, tmp_path, monkeypatch):

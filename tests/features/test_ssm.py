@@ -206,16 +206,6 @@ def test_it_is_refused_by_other_networks_images_and_windows(cells, learned, data
     assert cached.whitening.origin == learned.whitening.origin != ""
 
 
-def test_a_damaged_file_is_made_again(cells, dataset, tmp_path):
-    expected = fit_to_database(cells, dataset.database, FeatureCache(tmp_path)).whitening
-    [path] = kept(tmp_path)
-    content = path.read_bytes()
-    path.write_bytes(content[:-100] + bytes(100))
-    whitening = fit_to_database(cells, dataset.database, FeatureCache(tmp_path)).whitening
-    np.testing.assert_array_equal(whitening.components, expected.components)
-    assert path.read_bytes() == content
-
-
 def test_images_that_cannot_be_read_are_left_out_only_where_they_may_be(cells, dataset, tmp_path):
     for name in dataset.database.names[:3]:
         shutil.copy(dataset.database.root / name, tmp_path)

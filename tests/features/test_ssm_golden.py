@@ -10,8 +10,9 @@ from mfvpr.datasets import resize
 from mfvpr.evaluation import FrameCorrelation
 from mfvpr.features import WindowFitting
 from mfvpr.features.extractor import local_features
-from mfvpr.features.ssm_features import SsmMaps, normalize_maps, whiten_windows
+from mfvpr.features.ssm_features import SsmMaps, whiten_windows
 from mfvpr.features.whitening import Windows, kernels
+from mfvpr.networks.layers import of_unit_length
 from mfvpr.retrieval.retriever import vote
 from tests.baselines.test_grid_anchors import cells
 from tests.golden import make_ssm
@@ -43,7 +44,7 @@ def rows_of(num_database, num_queries):
 def of_maps(case, stage):
     """Whitened windows of the made-up maps."""
     maps = [made_up_map(MAPS[case], stage, *row) for row in rows_of(make_ssm.DATABASE, make_ssm.QUERIES)]
-    return described(np.asarray(normalize_maps(np.stack(maps))), stage, make_ssm.DATABASE)
+    return described(np.asarray(of_unit_length(np.stack(maps))), stage, make_ssm.DATABASE)
 
 
 def of_images(case, stage):

@@ -7,5 +7,6 @@ from pathlib import Path
 import numpy as np
 
 name, *arguments = sys.argv[1:]
+sys.path[:0] = arguments  # clones of public code
 arrays = import_module(f"tests.golden.make_{name}").main(*arguments)
 np.savez_compressed(Path(__file__).parent / f"{name}.npz", **arrays)

@@ -4,7 +4,6 @@ CLONE is a clone of https://github.com/Shiaoming/ALIKED, WEIGHTS the folder of i
 It needs torchvision; its own compiled operator is written out here.
 """
 
-import sys
 from pathlib import Path
 from typing import NamedTuple
 
@@ -71,8 +70,7 @@ class _Patches:
         return padded[:, rows[:, :, None], columns[:, None]].transpose(0, 1)
 
 
-def main(clone: str, weights: str, images: str) -> dict[str, np.ndarray]:
-    sys.path.insert(0, clone)
+def main(_: str, weights: str, images: str) -> dict[str, np.ndarray]:
     replace_module("custom_ops", get_patches=_Patches)
     import torch
     from nets.aliked import ALIKED
@@ -96,5 +94,4 @@ def main(clone: str, weights: str, images: str) -> dict[str, np.ndarray]:
             f"{case}/scores": result["scores"],
             f"{case}/projections": projections(result["descriptors"]),
         }
-        print(f"{case}: {len(result['scores'])} keypoints")
     return golden

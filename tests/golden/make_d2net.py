@@ -3,7 +3,6 @@
 CLONE is a clone of https://github.com/mihaidusmanu/d2-net.
 """
 
-import sys
 from typing import NamedTuple
 
 import numpy as np
@@ -85,8 +84,7 @@ def projections(descriptors: np.ndarray) -> np.ndarray:
     return (descriptors @ (directions / np.linalg.norm(directions, axis=0))).astype(np.float32)
 
 
-def main(clone: str) -> dict[str, np.ndarray]:
-    sys.path.insert(0, clone)
+def main(_: str) -> dict[str, np.ndarray]:
     import torch
     from lib.model_test import D2Net
     from lib.pyramid import process_multiscale
@@ -107,5 +105,4 @@ def main(clone: str) -> dict[str, np.ndarray]:
             f"{case}/scores": scores,
             f"{case}/projections": projections(descriptors),
         }
-        print(f"{case}: {len(scores)} keypoints")
     return golden

@@ -3,9 +3,7 @@
 `python -m tests.golden dinov2 CLONE` with a clone of https://github.com/facebookresearch/dinov2.
 """
 
-import sys
 from collections.abc import Iterator
-from typing import Any
 
 import numpy as np
 
@@ -24,10 +22,9 @@ CASES = (
 )
 
 
-def main(clone: str) -> dict[str, np.ndarray]:
+def main(_: str) -> dict[str, np.ndarray]:
     import torch
 
-    sys.path.insert(0, clone)
     with torch.inference_mode():
         golden = dict(_outputs())
     return {key: array.astype(np.float32) for key, array in golden.items()}
@@ -39,7 +36,8 @@ def _outputs() -> Iterator[tuple[str, np.ndarray]]:
 
     for case in CASES:
         depth, registers, size, index, seed = case
-        model = fill(_transformer(depth, registers), random_checkpoint(dinov2_shapes(WIDTH, depth, registers), seed))
+        public = vision_transformer("dinov2.layers", "dinov2.models.vision_transformer", WIDTH, depth, HEADS, registers)
+        model = fill(public, random_checkpoint(dinov2_shapes(WIDTH, depth, registers), seed))
         projected = []
         model.blocks[index].attn.qkv.register_forward_hook(lambda *call, into=projected: into.append(call[-1]))
         images, key = normalized(size), name(*case[:2], *size, index, seed)
@@ -56,11 +54,3 @@ def _outputs() -> Iterator[tuple[str, np.ndarray]]:
         identity = torch.eye(queries.shape[1], dtype=queries.dtype).expand(HEADS, -1, -1)
         attention = torch.nn.functional.scaled_dot_product_attention(queries, keys, identity)
         yield f"{key}/attention", attention[:, 0, first:].mean(dim=0).numpy()
-
-
-def _transformer(depth: int, registers: int) -> Any:
-    from dinov2.layers import MemEffAttention  # pyright: ignore
-    from dinov2.layers import NestedTensorBlock as Block  # pyright: ignore
-    from dinov2.models.vision_transformer import DinoVisionTransformer  # pyright: ignore
-
-    return vision_transformer(DinoVisionTransformer, Block, MemEffAttention, WIDTH, depth, HEADS, registers)

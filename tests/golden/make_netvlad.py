@@ -6,7 +6,6 @@ https://github.com/gmberton/CosPlace.
 """
 
 import importlib
-import sys
 import tempfile
 from collections.abc import Iterator
 from pathlib import Path
@@ -45,7 +44,7 @@ def name(*case: Any) -> str:
     return "/".join(map(str, case))
 
 
-def main(patch_netvlad: str, hloc: str, cosplace: str) -> dict[str, np.ndarray]:
+def main(_: str, hloc: str, __: str) -> dict[str, np.ndarray]:
     import torch
     from torchvision import models
 
@@ -54,9 +53,9 @@ def main(patch_netvlad: str, hloc: str, cosplace: str) -> dict[str, np.ndarray]:
         setattr(models, name_of_network, lambda maker=maker, **_: maker())
     replace_module("sklearn", neighbors=replace_module("sklearn.neighbors", NearestNeighbors=None))  # for training
     with torch.inference_mode():
-        golden = dict(_patches(patch_netvlad)) | dict(_positions())
+        golden = dict(_patches()) | dict(_positions())
         golden[name("matlab", *MATLAB)] = _matlab(hloc)
-        golden |= {name("gem", *case): _gem(cosplace, *case) for case in GEM}
+        golden |= {name("gem", *case): _gem(*case) for case in GEM}
     return {key: array.astype(np.float32) for key, array in golden.items()}
 
 
@@ -71,13 +70,11 @@ def normalized(size: tuple[int, int]) -> Any:
     return (pixels - mean) / deviation
 
 
-def _patches(clone: str) -> Iterator[tuple[str, np.ndarray]]:
+def _patches() -> Iterator[tuple[str, np.ndarray]]:
     """As Patch-NetVLAD's feature_extract.py, its global descriptor and all patches; without a projection NetVLAD's."""
     from configparser import ConfigParser
 
     import torch
-
-    sys.path.insert(0, clone)
     from patchnetvlad.models.models_generic import get_backend, get_model, get_pca_encoding
 
     for clusters, outputs, size, seed in CASES:
@@ -124,7 +121,6 @@ def _matlab(clone: str) -> np.ndarray:
     """As hloc's extractor, of a file as the original's."""
     import torch
 
-    sys.path.insert(0, clone)
     for package in ("hloc", "hloc.extractors", "hloc.utils"):  # without what it imports besides
         replace_module(package, __path__=[f"{clone}/{package.replace('.', '/')}"])
     extractor = importlib.import_module("hloc.extractors.netvlad")
@@ -139,9 +135,8 @@ def _matlab(clone: str) -> np.ndarray:
     return model({"image": pixels})["global_descriptor"].numpy()[0]
 
 
-def _gem(clone: str, backbone: str, outputs: int, size: tuple[int, int], seed: int) -> np.ndarray:
+def _gem(backbone: str, outputs: int, size: tuple[int, int], seed: int) -> np.ndarray:
     """As CosPlace's network."""
-    sys.path.insert(0, clone)
     from cosplace_model.cosplace_network import GeoLocalizationNet
 
     public = {"vgg16": "VGG16", "resnet50": "ResNet50"}[backbone]

@@ -3,10 +3,9 @@
 `python -m tests.golden selavpr CLONE` with a clone of https://github.com/Lu-Feng/SelaVPR.
 """
 
-import sys
 import types
 from collections.abc import Iterator
-from typing import Any
+from functools import partial
 
 import numpy as np
 
@@ -28,6 +27,7 @@ BACKBONES = (
 )
 # Maps that are matched: side, candidates, seed; one position has exactly one match.
 MATCHES = ((61, 4, 8), (9, 12, 9), (1, 2, 10))
+_transformer = partial(vision_transformer, "backbone.dinov2", "backbone.vision_transformer")
 
 
 def maps(side: int, candidates: int, seed: int) -> tuple[np.ndarray, np.ndarray]:
@@ -40,22 +40,13 @@ def maps(side: int, candidates: int, seed: int) -> tuple[np.ndarray, np.ndarray]
     return query.astype(np.float32), similar.astype(np.float32)
 
 
-def main(clone: str) -> dict[str, np.ndarray]:
+def main(_: str) -> dict[str, np.ndarray]:
     import torch
 
-    sys.path.insert(0, clone)
     torch.Tensor.cuda = lambda self: self  # pyright: ignore  (its scores ask for a GPU)
     with torch.inference_mode():
         golden = dict(_networks()) | dict(_backbones()) | dict(_scores())
     return {key: array.astype(np.float32) for key, array in golden.items()}
-
-
-def _transformer(width: int, depth: int, heads: int, registers: int) -> Any:
-    from backbone.dinov2 import MemEffAttention  # pyright: ignore
-    from backbone.dinov2 import NestedTensorBlock as Block  # pyright: ignore
-    from backbone.vision_transformer import DinoVisionTransformer  # pyright: ignore
-
-    return vision_transformer(DinoVisionTransformer, Block, MemEffAttention, width, depth, heads, registers)
 
 
 def _networks() -> Iterator[tuple[str, np.ndarray]]:

@@ -2,6 +2,7 @@
 
 import sys
 from functools import partial
+from importlib import import_module
 from types import ModuleType
 from typing import Any
 
@@ -23,8 +24,9 @@ def replace_module(name: str, **members: Any) -> ModuleType:
     return module
 
 
-def vision_transformer(network: Any, block: Any, attention: Any, width: int, depth: int, heads: int, registers: int):
-    """DINOv2's transformer for 518 px, of the classes of public code."""
+def vision_transformer(layers: str, network: str, width: int, depth: int, heads: int, registers: int) -> Any:
+    """DINOv2's transformer for 518 px, of the classes in two modules of public code."""
+    block, attention = (getattr(import_module(layers), name) for name in ("NestedTensorBlock", "MemEffAttention"))
     options = {"img_size": 518, "patch_size": 14, "mlp_ratio": 4, "init_values": 1, "block_chunks": 0}
     options |= {"embed_dim": width, "depth": depth, "num_heads": heads, "num_register_tokens": registers}
-    return network(**options, block_fn=partial(block, attn_class=attention))
+    return import_module(network).DinoVisionTransformer(**options, block_fn=partial(block, attn_class=attention))

@@ -16,7 +16,7 @@ from mfvpr.storage.cache_files import round_as_stored
 from mfvpr.storage.maps import FILE, Entry, MapFile
 from tests.programs import ROOT
 from tests.small_disks import UNSHARE, mount, need_small_disks
-from tests.storage.synthetic_features import assert_same, features_of
+from tests.storage.synthetic_features import assert_same, features_of, run_here
 
 pytestmark = pytest.mark.thorough
 
@@ -48,7 +48,7 @@ def assert_whole(folder, least):
 
 def kill_rounds(folder, rounds):
     """Kill processes that add; forks, to save imports. A row counts when its line was written."""
-    rng, number, before = random.Random(0), 0, 0
+    folder, rng, number, before = Path(folder), random.Random(0), 0, 0
     for _ in range(rounds):
         reading, writing = os.pipe()
         if (child := os.fork()) == 0:
@@ -69,10 +69,7 @@ def kill_rounds(folder, rounds):
 
 @pytest.mark.slow
 def test_killed_while_adding_it_has_whole_rows_and_loses_none(tmp_path):
-    code = "from pathlib import Path\nfrom tests.localization.test_kills import *\n"
-    code += f"kill_rounds(Path({str(tmp_path / 'map')!r}), 40)"
-    done = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, timeout=120)
-    assert done.returncode == 0, done.stderr
+    run_here(__name__, f"kill_rounds({str(tmp_path / 'map')!r}, 40)")
 
 
 @pytest.mark.slow
@@ -152,6 +149,4 @@ def fill(disk):
 
 def test_on_a_full_disk_rows_stay_and_adding_goes_on(tmp_path):
     need_small_disks(tmp_path)
-    code = f"from tests.localization.test_kills import fill; fill({str(tmp_path)!r})"
-    done = subprocess.run([*UNSHARE, sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True)
-    assert done.returncode == 0, done.stderr
+    run_here(__name__, f"fill({str(tmp_path)!r})", prefix=UNSHARE)

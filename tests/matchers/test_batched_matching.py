@@ -22,8 +22,7 @@ from mfvpr.evaluation import stages
 from mfvpr.evaluation.rankings import rank_shortlist
 from mfvpr.features import FeatureSet, InMemory
 from mfvpr.matchers import NearestNeighborMatcher
-from mfvpr.matchers import batched_matching as batched
-from mfvpr.matchers.match_set import batches, shapes, slots, split_rows
+from mfvpr.matchers.match_set import QUERIES, batches, shapes, slots, split_rows
 from mfvpr.storage.cache_files import round_as_stored
 from tests.builders import make_features, make_shortlist
 from tests.features.test_feature_set import Counting
@@ -200,7 +199,7 @@ def test_a_plain_function_is_compiled_once_for_all_queries(compilations):
     def near(query, candidate):
         return mfvpr.filter_matches(mfvpr.match(query, candidate), max_distance=0.9)
 
-    for count in (batched.QUERIES, 3 * batched.QUERIES):
+    for count in (QUERIES, 3 * QUERIES):
         queries, database = (FeatureSet.of(images_of([20] * number, number)) for number in (count, 40))
         candidates = shortlist_of(0, count, 40)
         compilations.reset()

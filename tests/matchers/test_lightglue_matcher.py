@@ -13,7 +13,7 @@ from mfvpr.core.types import per_keypoint, per_match
 from mfvpr.evaluation import Pipeline, stages
 from mfvpr.features import FeatureSet, Scale, Sift
 from mfvpr.matchers.match_set import split_rows
-from mfvpr.networks.lightglue_assignment import assignment
+from mfvpr.networks.lightglue import assignment
 from mfvpr.retrieval import ShortlistFiles
 from mfvpr.storage.cache_files import MatchStore
 from mfvpr.utils import recipe_of

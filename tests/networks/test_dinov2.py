@@ -15,7 +15,7 @@ from mfvpr.utils import InputError
 from tests.golden.make_dinov2 import CASES, HEADS, WIDTH
 from tests.golden.make_netvlad import image, name, samples
 from tests.networks.checkpoints import fill
-from tests.networks.test_netvlad import assert_close, assert_separate_images
+from tests.networks.test_netvlad import assert_close
 from tests.random_checkpoints import dinov2_shapes, random_checkpoint
 
 pytestmark = pytest.mark.thorough
@@ -112,8 +112,3 @@ def test_the_global_descriptor_is_the_class_token_of_retrieval():
 def test_wrong_settings_are_one_line(settings, words):
     with pytest.raises(InputError, match=f"^{words}[^\n]*$"):
         Dinov2Features(network(), **settings)
-
-
-@pytest.mark.optimized
-def test_images_of_a_batch_do_not_see_each_other_and_one_program_is_compiled(compilations):
-    assert_separate_images(Dinov2Features(network(), (28, 28)), compilations)

@@ -14,7 +14,7 @@ from mfvpr.checkpoints.networks import plan_network
 from mfvpr.core.types import per_keypoint
 from mfvpr.matchers import LightGlueMatcher
 from mfvpr.networks import LightGlue
-from mfvpr.networks.lightglue_assignment import assignment
+from mfvpr.networks.lightglue import assignment
 from mfvpr.utils import InputError
 from tests.builders import double, read_golden, stack
 from tests.golden import make_lightglue_real

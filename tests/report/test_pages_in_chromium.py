@@ -86,6 +86,15 @@ def test_pages_and_their_charts_fit(tab, tmp_path, name, width):
     assert pixels.std() > 10
 
 
+def test_labels_of_charts_are_names_and_no_html(tab):
+    page = tab.page("one")
+    assert page.locator("#chart-depths .legendtext").all_text_contents() == [*SYSTEMS]
+    assert {*page.locator("#chart-intervals .ytick").all_text_contents()} == {*SYSTEMS}
+    lines = page.locator("#chart-depths .scatterlayer .js-line")
+    colors = lines.evaluate_all("lines => lines.map(one => one.style.stroke)")
+    assert colors == ["rgb(138, 143, 152)", "rgb(11, 132, 198)", "rgb(225, 112, 26)"]
+
+
 def test_tables_are_sorted_by_click_and_by_key(tab):
     page = tab.page("one")
     scores, header = cells(page, 4), page.locator("[aria-label='Top predictions'] th").nth(3)
@@ -122,13 +131,11 @@ def test_answers_are_filtered_by_click_and_by_key(tab):
 
 def test_the_theme_follows_a_choice(tab):
     page = tab.page("one", scheme="dark")
-    look = "['body', '.xtick text'].map(one => getComputedStyle(document.querySelector(one))).map(one => [one."
-    look += "backgroundColor, one.fill])"
-    [before, _], [_, text] = page.evaluate(look)
+    look = "['body', '.xtick text'].map(one => getComputedStyle(document.querySelector(one)).%s)"
+    before, text = page.evaluate(look % "backgroundColor")[0], page.evaluate(look % "fill")[1]
     page.get_by_role("button", name="Light", exact=True).click()
-    [after, _], [_, new_text] = page.evaluate(look)
-    assert before != after
-    assert text != new_text
+    assert before != page.evaluate(look % "backgroundColor")[0]
+    assert text != page.evaluate(look % "fill")[1]
 
 
 def test_the_keyboard_reaches_everything(tab):

@@ -11,13 +11,13 @@ import mfvpr
 from mfvpr import datasets
 from mfvpr.datasets import IndexFile
 from mfvpr.datasets.ground_truth import RADIUS, TOLERANCES
-from mfvpr.evaluation import DriveFilter, Fusion
+from mfvpr.evaluation import Fusion
 from mfvpr.evaluation.dataset_ranking import KS
 from mfvpr.features import Aggregated, Sift, VladFitting
 from mfvpr.report.pages import Run
 from mfvpr.retrieval import Retrieval
 from mfvpr.utils import InputError
-from tests.programs import composed, csv_rows
+from tests.programs import composed
 
 pytestmark = pytest.mark.thorough
 
@@ -77,24 +77,6 @@ def test_predictions_are_written_with_full_paths_and_correct_images(result, data
     assert {path.name for path in (tmp_path / "parts").iterdir()} == {"first", "second"}
     with pytest.raises(InputError, match="expected one data set"):
         result.write_predictions(tmp_path / "all")
-
-
-def test_a_run_folder_says_which_predictions_a_sequence_changes(dataset, systems, tmp_path):
-    filters = DriveFilter(), DriveFilter("smoothed")
-    result = mfvpr.evaluate(dataset, replace(systems["paper"], sequences={"histogram": filters}))
-    result.save(tmp_path / "run")
-    lines = [[*line.values()] for line in csv_rows(tmp_path / "run" / "changes.csv")]
-    expected, alone = [], csv_rows(tmp_path / "run" / "predictions" / "histogram.csv")
-    for method in ("causal", "smoothed"):
-        together = csv_rows(tmp_path / "run" / "predictions" / f"histogram_{method} sequence.csv")
-        pairs = ([line for line in table if line["rank"] == "1"] for table in (alone, together))
-        for before, after in zip(*pairs, strict=True):
-            cells = [before["database"], before["correct"], after["database"], after["correct"]]
-            if before["database"] != after["database"]:
-                expected.append([f"histogram + {method} sequence", dataset.only.name, before["query"], *cells])
-    assert lines == expected != []
-    result.write_report(tmp_path / "report.html")
-    assert "that the other queries of a drive change" in (tmp_path / "report.html").read_text()
 
 
 def test_predictions_are_those_of_the_score_that_decides(result, dataset):

@@ -26,10 +26,8 @@ def root(tmp_path_factory):
     return shared(tmp_path_factory)
 
 
-@pytest.mark.first_case
-@pytest.mark.parametrize("final", ["score", "combined"])
-def test_every_first_answer_has_the_shift_that_the_library_says(root, tmp_path, final):
-    settings = settings_of(*small(root), *STEERING, f"final={final}", f"out={tmp_path}/out")
+def test_every_first_answer_has_the_shift_that_the_library_says(root, tmp_path):
+    settings = settings_of(*small(root), *STEERING, "final=combined", f"out={tmp_path}/out")
     evaluation.evaluate(settings)
     lines, first = csv_rows(tmp_path / "out" / "shifts.csv"), {}
     for line in reversed(csv_rows(tmp_path / "out" / "predictions.csv")):
@@ -76,13 +74,3 @@ def test_shifts_are_those_of_the_middle_of_the_query_in_either_direction(directi
     assert (intervals[0, 1] - intervals[0, 0] >= 2 * SHIFT_FLOOR * 320).all()  # of the longer side, along both axes
     assert sizes[0].tolist() == [*size0]
     assert np.isnan([*shifts[1], *intervals[1].ravel()]).all()
-
-
-def test_refused_answers_have_no_shift(root, tmp_path):
-    evaluation.evaluate(settings_of(*small(root), *STEERING, f"out={tmp_path}/first"))
-    confidence = (f"confidence={tmp_path}/first/confidence.json", "threshold=0.25", f"out={tmp_path}/out")
-    evaluation.evaluate(settings_of(*small(root), *STEERING, *confidence))
-    predictions = {line["query"]: line["prediction"] for line in csv_rows(tmp_path / "out" / "top_predictions.csv")}
-    places = {query: prediction for query, prediction in predictions.items() if prediction != "no place"}
-    assert 0 < len(places) < len(predictions)
-    assert {line["query"]: line["prediction"] for line in csv_rows(tmp_path / "out" / "shifts.csv")} == places

@@ -7,8 +7,7 @@ import string
 import pytest
 
 from mfvpr.report import Table
-from mfvpr.report.runs import file_names
-from mfvpr.report.tables import read_csv, write_csv
+from mfvpr.report.runs import file_names, read_csv, write_csv
 from mfvpr.utils import InputError
 
 NAMES = ["a\rb", "a\r\nb\r\n", "a\nb", "\r", 'a,"b"', "=a", "\udcff.png"]

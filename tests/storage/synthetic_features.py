@@ -2,7 +2,9 @@
 
 import hashlib
 import itertools
-from collections.abc import Callable, Iterable, Iterator
+import subprocess
+import sys
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +15,7 @@ from mfvpr import Features, Matches
 from mfvpr.matchers import MatchSet
 from mfvpr.matchers.match_set import QueryMatches
 from tests.builders import make_features
+from tests.programs import ROOT
 
 
 def features_of(row: int, count: int = 40, dimension: int = 16) -> Features:
@@ -83,6 +86,14 @@ DAMAGE: dict[str, Callable[[Path], Any]] = {
     "flipped": lambda path: flip(path, path.stat().st_size // 2),
     "gone": lambda path: path.unlink(),
 }
+
+
+def run_here(module: str, call: str, *, prefix: Sequence[str] = ()) -> str:
+    """Standard output of a call of functions of a test module, in a process of its own."""
+    command = [*prefix, sys.executable, "-c", f"from {module} import *; {call}"]
+    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=120)
+    assert done.returncode == 0, done.stderr
+    return done.stdout
 
 
 def digests(folder: Path) -> dict[str, str]:

@@ -5,8 +5,6 @@ import json
 import os
 import shutil
 import signal
-import subprocess
-import sys
 import time
 from dataclasses import fields, replace
 from pathlib import Path
@@ -28,9 +26,8 @@ from mfvpr.storage.cache_files import (
     unpack_matches,
 )
 from mfvpr.utils.fingerprints import fingerprint
-from tests.programs import ROOT
 from tests.small_disks import UNSHARE, mount, need_small_disks
-from tests.storage.synthetic_features import DAMAGE, assert_same, digests, features_of, matches_of
+from tests.storage.synthetic_features import DAMAGE, assert_same, digests, features_of, matches_of, run_here
 
 pytestmark = pytest.mark.thorough
 
@@ -185,17 +182,9 @@ def kill_rounds(root, rounds):
     print(killed)
 
 
-def run_here(call, *, prefix=()):
-    """Standard output of a call of these functions in a process of its own."""
-    command = [*prefix, sys.executable, "-c", f"from tests.storage.test_cache_files import *; {call}"]
-    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=120)
-    assert done.returncode == 0, done.stderr
-    return done.stdout
-
-
 @pytest.mark.slow
 def test_killed_processes_leave_whole_files(tmp_path):
-    assert int(run_here(f"kill_rounds({str(tmp_path)!r}, 40)")) >= 40
+    assert int(run_here(__name__, f"kill_rounds({str(tmp_path)!r}, 40)")) >= 40
 
 
 def fill_disk(root):
@@ -216,4 +205,4 @@ def fill_disk(root):
 
 def test_a_full_disk_is_one_line_and_what_was_written_stays(tmp_path):
     need_small_disks(tmp_path)
-    run_here(f"fill_disk({str(tmp_path)!r})", prefix=UNSHARE)
+    run_here(__name__, f"fill_disk({str(tmp_path)!r})", prefix=UNSHARE)

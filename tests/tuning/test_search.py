@@ -11,7 +11,7 @@ from mfvpr.baselines.learned_weight import named_weight
 from mfvpr.core import hits
 from mfvpr.datasets import FrameTruth
 from mfvpr.evaluation import best_setting, evaluation_protocol, statistics
-from mfvpr.report import sweeps
+from mfvpr.report import searches
 from mfvpr.tuning import sweeps as sweeping
 from mfvpr.tuning.sweeps import Axes, suggest_setting
 from tests.needs import needs
@@ -142,7 +142,7 @@ def test_optuna_proposes_after_the_own_values_and_learns_from_the_queries_that_c
     assert outcome.rows.shape == (3, 4, QUERIES, 1)
     trials = outcome.protocol.tuning(outcome.rows)[:, 1:, 1]  # the own values are no choice
     assert outcome.chosen == (1 + np.argmax(trials, axis=1)).tolist()
-    assert sweeps.sweep_figures(outcome) == []
+    assert searches.sweep_figures(outcome) == []
     settings = [axes.setting(plain) for plain in outcome.settings]
     rows = rank(SUM, settings, *data, views=outcome.protocol.views, ks=[1])
     np.testing.assert_array_equal(outcome.rows, rows)

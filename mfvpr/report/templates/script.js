@@ -70,7 +70,7 @@ function isDark() {
 
 function paint() {
   theme.textContent = isDark() ? "Light" : "Dark";
-  for (const name of Object.keys(charts)) Plotly.update(`chart-${name}`, ...colors());
+  for (const { name } of charts) Plotly.update(`chart-${name}`, ...colors());
 }
 
 theme.hidden = false;
@@ -93,18 +93,37 @@ const axis = (text, rest) => (
   { fixedrange: true, automargin: true, zeroline: false, ...rest, title: { text, font: { size: 13 } } }
 );
 
-function line(trace) {
-  return { type: "scatter", mode: "lines", hovertemplate: "%{x:.4g}: %{y:.1f} %", ...trace };
+// Colors on dark and light, and dashes, which tell curves apart without colors. All are compared with the first, in gray.
+const palette = ["#0b84c6", "#e1701a", "#1a9e6f", "#c9559d", "#9a7bd0", "#b58900", "#d1495b", "#5f9ea0"];
+const dashes = ["solid", "dash", "dot", "dashdot"];
+const color = (place) => (place === 0 ? "#8a8f98" : palette[(place - 1) % palette.length]);
+const dash = (place) => (place === 0 ? "solid" : dashes[Math.floor((place - 1) / palette.length) % dashes.length]);
+// Plotly's labels understand some HTML.
+const escaped = (text) => text.replaceAll("&", "&amp;").replaceAll("<", "&lt;").replaceAll(">", "&gt;");
+
+function line([name, points], place) {
+  return {
+    type: "scatter", mode: "lines", hovertemplate: "%{x:.4g}: %{y:.1f} %", name: escaped(name),
+    x: points.map(([x]) => x), y: points.map(([, y]) => y), line: { color: color(place), dash: dash(place), width: 2 },
+  };
 }
 
-function bar(trace) {
-  const whiskers = { type: "data", symmetric: false, thickness: 1.2, width: 3, ...trace.error_x };
-  return { type: "bar", orientation: "h", hovertemplate: "%{y}: %{x:.1f} %", ...trace, error_x: whiskers };
+// A group has a color, a member a place on the axis; members of a single group have a color each.
+function bar([name, members], place, groups) {
+  const whiskers = {
+    type: "data", symmetric: false, thickness: 1.2, width: 3,
+    array: members.map(([, value, [, high]]) => high - value), arrayminus: members.map(([, value, [low]]) => value - low),
+  };
+  return {
+    type: "bar", orientation: "h", hovertemplate: "%{y}: %{x:.1f} %", name: escaped(name), error_x: whiskers,
+    x: members.map(([, value]) => value), y: members.map(([member]) => escaped(member)),
+    marker: { color: groups.length === 1 ? members.map((_, number) => color(number)) : color(place) },
+  };
 }
 
-const drawn = Object.entries(charts).map(([name, { kind, scale, axes, data }]) => {
-  const isBars = kind === "bars";
-  const bars = isBars ? data.reduce((sum, { y }) => sum + y.length, 0) : 0;
+const drawn = charts.map(({ name, scale, axes, data }) => {
+  const isBars = scale === "share";
+  const bars = isBars ? data.reduce((sum, [, members]) => sum + members.length, 0) : 0;
   const layout = {
     ...look, height: Math.max(380, 100 + 16 * bars), showlegend: data.length > 1,
     xaxis: axis(axes[0], scales[scale]),
