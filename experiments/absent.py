@@ -8,16 +8,18 @@ whose places it does not show.
 """
 
 import itertools
+from collections import defaultdict
+from dataclasses import replace
 
 import numpy as np
 from jaxtyping import Bool, Float
 
+from experiments.drives import datasets_of, main
 from mfvpr.cli.command_line import load_system
-from mfvpr.cli.programs import Parser, run_command
-from mfvpr.datasets.datasets import folder
 from mfvpr.evaluation import Confidence, confidence_inputs, fit_confidence, rank_dataset
 from mfvpr.evaluation.confidence import reliability
 from mfvpr.localization.map_settings import fit_on_drive
+from mfvpr.report import Table
 from mfvpr.storage import FeatureCache
 
 SURE = 0.8  # confidence from which on a prediction is taken for an answer
@@ -37,33 +39,25 @@ def row(confidence: Confidence, present: list[Ranked], absent: list[Ranked]) -> 
     return [f"{100 * share:.0f}" for share in (error, answered[0].mean(), answered[1][is_correct].mean())]
 
 
-def run(drives: list[str]) -> None:
+def run(drives: list[str], features: str) -> None:
     """Print a table of all drives."""
-    system, cache = load_system("mfvpr"), FeatureCache()
-    folders = {name: paths.split(":") for name, _, paths in (drive.partition("=") for drive in drives)}
-    datasets = {name: folder(*paths, ground_truth="order") for name, paths in folders.items()}
+    datasets, cache, system = datasets_of(drives), FeatureCache(), load_system("mfvpr", features=features)
     data = {name: fit_on_drive(dataset, system, cache)[1] for name, dataset in datasets.items()}
     present = {name: (values.present, values.correct) for name, values in data.items()}
-    absent = {}
-    for place, other in itertools.permutations(folders, 2):
-        elsewhere = folder(folders[place][0], folders[other][1], ground_truth="none")
+    absent = defaultdict[str, list[Ranked]](list)
+    for place, other in itertools.permutations(datasets, 2):
+        elsewhere = replace(datasets[place], sequences=(replace(datasets[other].only, truth=None),))
         [ranked] = rank_dataset(elsewhere, system, cache=cache).systems[system.headline]
-        absent[place, other] = confidence_inputs(ranked), np.zeros(len(ranked.rows), bool)
-    print("| fitted on | queries count | ECE, % | absent, answered, % | present and correct, answered, % |")
-    print("| :-- | :-- | --: | --: | --: |")
+        absent[place].append((confidence_inputs(ranked), np.zeros(len(ranked.rows), bool)))
+    header = ["fitted on", "queries count", "ECE, %", "absent, answered, %", "present and correct, answered, %"]
+    rows = []
     for name in datasets:
-        fits = {"once": fit_confidence(*present[name]), "twice": data[name].fit()}
-        for turns, confidence in fits.items():
-            cells = row(confidence, [each for other, each in present.items() if other != name],
-                        [each for (place, _), each in absent.items() if place != name])  # fmt: skip
-            print(f"| {name} | {turns} | {' | '.join(cells)} |")
-
-
-def add_arguments(parser: Parser) -> None:
-    """Declare the command line."""
-    parser.add_argument("drives", nargs="+", metavar="NAME=DATABASE:QUERIES", help="two or more drives")
-    parser.set_defaults(run="experiments.absent:run")
+        others = [other for other in datasets if other != name]
+        for turns, confidence in (("once", fit_confidence(*present[name])), ("twice", data[name].fit())):
+            here, elsewhere = [present[other] for other in others], [each for other in others for each in absent[other]]
+            rows.append([name, turns, *row(confidence, here, elsewhere)])
+    print(Table(header, rows, 2).markdown())
 
 
 if __name__ == "__main__":
-    run_command("python -m experiments.absent", str(__doc__), add_arguments)
+    main("absent", __doc__)

@@ -22,27 +22,25 @@ from collections.abc import Iterator, Mapping, Sequence
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
+from experiments.drives import NEAR, datasets_of, main
 from mfvpr.cli.command_line import load_system
-from mfvpr.cli.programs import Parser, run_command
 from mfvpr.core.types import Shortlist
-from mfvpr.datasets.datasets import Dataset, folder
+from mfvpr.datasets import Dataset
 from mfvpr.evaluation import System, rank_dataset
 from mfvpr.evaluation.drives import Drive, DriveFilter
 from mfvpr.evaluation.rankings import FrameCorrelation, Ranked
 from mfvpr.evaluation.statistics import path_test
+from mfvpr.report import Table
 from mfvpr.retrieval import Retrieval
 from mfvpr.storage import FeatureCache
 
-NEAR = 2  # frames
 STEADY, ANY = np.arange(0.8, 1.25, 0.1), np.arange(-8, 8.5, 0.5)  # rows from one image to the next
 TRAJECTORY = 10  # images
 
-Drives = dict[str, Int[np.ndarray, " images"]]
 Matrix = Float[np.ndarray, "queries rows"]
-Hits = dict[str, Bool[np.ndarray, " images"]]
 
 
-def drives(number: int) -> Drives:
+def drives_along(number: int) -> dict[str, Int[np.ndarray, " images"]]:
     """Query images of each drive along a data set of a number of queries."""
     rows = np.arange(number)
     stops = np.repeat(rows, 1 + 2 * ((rows > number // 3) & (rows < number // 2)))
@@ -85,71 +83,55 @@ class Place:
         self.number, self._rows = len(dataset.only.images), len(dataset.database)
         sides = (dataset.only.images, dataset.database)
         queries, database = (cache.vectors(each, retriever.describer, dataset.database).values for each in sides)
-        self._similarities = queries @ database.T
-        self._scores = np.full((self.number, self._rows), np.nan)
-        there = self._ranked.rows >= 0
-        self._scores[np.nonzero(there)[0], self._ranked.rows[there]] = self._ranked.scores[there]
+        scores, there = np.full((self.number, self._rows), np.nan), self._ranked.rows >= 0
+        scores[np.nonzero(there)[0], self._ranked.rows[there]] = self._ranked.scores[there]
+        self._matrices = {"SeqSLAM": queries @ database.T, "scores": scores}
 
-    def hits(self, images: Int[np.ndarray, " images"]) -> Hits:
+    def hits(self, images: Int[np.ndarray, " images"]) -> dict[str, Bool[np.ndarray, " images"]]:
         """Whether the first row of each image is correct, by method."""
         ranked = Ranked(self._ranked.rows[images], self._ranked.scores[images])
         shortlist = Shortlist(ranked.rows, ranked.scores, ranked.rows >= 0)
+        filters = {method: DriveFilter(method) for method in ("causal", "lagged", "smoothed")}
+        filters["at speed 1"] = DriveFilter("causal", Drive(advance=1))
         first = {"single": ranked.rows[:, 0]}
-        for method in ("causal", "lagged", "smoothed"):
-            first[method] = DriveFilter(method)(ranked, self._rows).rows[:, 0]
-        first["at speed 1"] = DriveFilter("causal", Drive(advance=1))(ranked, self._rows).rows[:, 0]
+        first |= {name: drive_filter(ranked, self._rows).rows[:, 0] for name, drive_filter in filters.items()}
         frames = np.where(shortlist.mask, FrameCorrelation()(shortlist, ranked.scores), -np.inf)
         first["frames"] = ranked.rows[np.arange(len(images)), frames.argmax(axis=1)]
-        similarities, scores = standardized(self._similarities[images]), standardized(self._scores[images])
-        matrices = {
-            f"{name} {rows}": trajectories(values, speeds, TRAJECTORY)
-            for name, values in (("SeqSLAM", similarities), ("scores", scores))
-            for rows, speeds in (("1", STEADY), ("any", ANY))
-        }
-        first |= {name: values.argmax(axis=1) for name, values in matrices.items()}
+        for name, matrix in self._matrices.items():
+            for rows, speeds in (("1", STEADY), ("any", ANY)):
+                means = trajectories(standardized(matrix[images]), speeds, TRAJECTORY)
+                first[f"{name} {rows}"] = means.argmax(axis=1)
         return {name: np.abs(rows - images) <= NEAR for name, rows in first.items()}
 
 
 def lines(places: Mapping[str, Sequence[Place]]) -> Iterator[list[str]]:
     """Rows of the table: recall of each set and drive, then gains over single images, pooled over the sets."""
-    pooled = {drive: list[tuple[Int[np.ndarray, " images"], Hits]]() for drive in drives(1)}  # with places along a path
+    pooled = defaultdict[str, list[tuple[np.ndarray, np.ndarray]]](list)  # places along a path, and hits by method
     for number, (name, parts) in enumerate(places.items()):
-        for drive, all_hits in pooled.items():
-            images = [drives(place.number)[drive] for place in parts]
-            hits = [place.hits(each) for place, each in zip(parts, images, strict=True)]
-            all_hits += [(number * 10**6 + each, part) for each, part in zip(images, hits, strict=True)]
-            recalls = [np.concatenate([part[method] for part in hits]).mean() for method in hits[0]]
-            yield [name, drive, *(f"{100 * recall:.1f}" for recall in recalls)]
-    for drive, all_hits in pooled.items():
-        path = np.argsort(np.concatenate([images for images, _ in all_hits]), kind="stable")
-        hits = {method: np.concatenate([part[method] for _, part in all_hits])[path] for method in all_hits[0][1]}
-        alone, cells = hits.pop("single"), []
-        for correct in hits.values():
+        for drive in drives_along(1):
+            images = [drives_along(place.number)[drive] for place in parts]
+            of_parts = [[*place.hits(each).values()] for place, each in zip(parts, images, strict=True)]
+            hits = np.concatenate(of_parts, axis=1)
+            pooled[drive].append((number * 10**6 + np.concatenate(images), hits))
+            yield [name, drive, *(f"{100 * recall:.1f}" for recall in hits.mean(axis=1))]
+    for drive, of_sets in pooled.items():
+        path, hits = (np.concatenate(each, axis=-1) for each in zip(*of_sets, strict=True))
+        (alone, *others), cells = hits[:, np.argsort(path, kind="stable")], []
+        for correct in others:
             gain, p = correct.mean() - alone.mean(), path_test(correct, alone).p_value
             cells.append(f"{100 * correct.mean():.1f} ({100 * gain:+.1f}, p {p:.3f})")
         yield ["all", drive, f"{100 * alone.mean():.1f}", *cells]
 
 
-def run(arguments: list[str], features: str) -> None:
+def run(drives: list[str], features: str) -> None:
     """Print a table of all data sets."""
-    system, cache = load_system("mfvpr", features=features), FeatureCache()
+    datasets, cache, system = datasets_of(drives), FeatureCache(), load_system("mfvpr", features=features)
     places = defaultdict[str, list[Place]](list)
-    for name, _, paths in (argument.partition("=") for argument in arguments):
-        dataset = folder(*paths.split(":"), ground_truth="order")
+    for name, dataset in datasets.items():
         places[name.partition(".")[0]].append(Place(dataset, system, cache))
-    names = next(iter(places.values()))[0].hits(np.arange(1))
-    print(f"| R@1 ±{NEAR} | drive | {' | '.join(names)} |")
-    print(f"| :-- | :-- |{' --: |' * len(names)}")
-    for cells in lines(places):
-        print(f"| {' | '.join(cells)} |", flush=True)
-
-
-def add_arguments(parser: Parser) -> None:
-    """Declare the command line."""
-    parser.add_argument("arguments", nargs="+", metavar="NAME=DATABASE:QUERIES", help="drives along data sets")
-    parser.add_argument("--features", default="aliked", metavar="NAME", help="choice of the group features")
-    parser.set_defaults(run="experiments.sequences:run")
+    methods = next(iter(places.values()))[0].hits(np.arange(1))
+    print(Table([f"R@1 ±{NEAR}", "drive", *methods], [*lines(places)], 2).markdown())
 
 
 if __name__ == "__main__":
-    run_command("python -m experiments.sequences", str(__doc__), add_arguments)
+    main("sequences", __doc__)

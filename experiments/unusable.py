@@ -15,22 +15,21 @@ import numpy as np
 import scipy
 from jaxtyping import Float, UInt8
 
+from experiments.drives import NEAR, datasets_of, main
 from mfvpr.cli.command_line import load_system
-from mfvpr.cli.programs import Parser, run_command
-from mfvpr.datasets.datasets import folder
 from mfvpr.localization import Map, Prediction
+from mfvpr.report import Table
 from mfvpr.storage import FeatureCache
 
 STEP = 10  # queries
-NEAR = 2  # frames: within them, a prediction is correct
 
 Pixels = Float[np.ndarray, "height width 3"]
 Change = Callable[[Pixels, np.random.Generator], Pixels]
 
 
-def plain(level: float, noise: float = 0) -> Change:
-    """An image of one gray level with Gaussian noise of a standard deviation."""
-    return lambda image, rng: level + noise * rng.normal(size=image.shape)
+def noise(level: float, deviation: float) -> Change:
+    """An image of one gray level with Gaussian noise."""
+    return lambda image, rng: level + deviation * rng.normal(size=image.shape)
 
 
 def lens_cap(image: Pixels, rng: np.random.Generator) -> Pixels:
@@ -40,29 +39,32 @@ def lens_cap(image: Pixels, rng: np.random.Generator) -> Pixels:
 
 def coarse_noise(image: Pixels, rng: np.random.Generator) -> Pixels:
     """Noise of spots of a few px."""
-    noise = scipy.ndimage.gaussian_filter(rng.normal(size=image.shape), (2, 2, 0))
-    return 128 + 50 * noise / noise.std()
+    spots = scipy.ndimage.gaussian_filter(rng.normal(size=image.shape), (2, 2, 0))
+    return 128 + 50 * spots / spots.std()
 
 
 def blur(share: float) -> Change:
     """Defocus: the mean over a square with a share of the width."""
-    side = lambda image: round(share * image.shape[1])  # noqa: E731
-    return lambda image, _: scipy.ndimage.uniform_filter(image, (side(image), side(image), 0), mode="nearest")
 
+    def change(image: Pixels, _: np.random.Generator) -> Pixels:
+        side = round(share * image.shape[1])
+        return scipy.ndimage.uniform_filter(image, (side, side, 0), mode="nearest")
 
-def expose(gain: float) -> Change:
-    """Brightness times a gain, clipped."""
-    return lambda image, _: gain * image
+    return change
 
 
 CHANGES: dict[str, Change] = {
-    "black": plain(0), "gray": plain(128), "white": plain(255), "lens cap": lens_cap,
-    "noise, 2": plain(128, 2), "noise, 10": plain(128, 10), "noise, 40": plain(128, 40), "noise, 80": plain(128, 80),
-    "random pixels": lambda image, rng: rng.uniform(0, 256, image.shape), "coarse noise": coarse_noise,
-    "blur over 4 % of the width": blur(0.04), "blur over 8 %": blur(0.08), "blur over 16 %": blur(0.16),
-    "4 times as bright": expose(4), "16 times as bright": expose(16), "64 times as bright": expose(64),
-    "a 16th as bright": expose(1 / 16),
-}  # fmt: skip
+    **{name: noise(level, 0) for name, level in (("black", 0), ("gray", 128), ("white", 255))},
+    "lens cap": lens_cap,
+    **{f"noise, {deviation}": noise(128, deviation) for deviation in (2, 10, 40, 80)},
+    "random pixels": lambda image, rng: rng.uniform(0, 256, image.shape),
+    "coarse noise": coarse_noise,
+    "blur over 4 % of the width": blur(0.04),
+    "blur over 8 %": blur(0.08),
+    "blur over 16 %": blur(0.16),
+    **{f"{gain} times as bright": lambda image, _, gain=gain: gain * image for gain in (4, 16, 64)},
+    "a 16th as bright": lambda image, _: image / 16,
+}
 
 
 def to_image(pixels: Pixels) -> UInt8[np.ndarray, "height width 3"]:
@@ -70,40 +72,31 @@ def to_image(pixels: Pixels) -> UInt8[np.ndarray, "height width 3"]:
     return np.clip(np.round(pixels), 0, 255).astype(np.uint8)
 
 
-def row(kind: str, rows: list[int], predictions: list[Prediction]) -> str:
+def row(kind: str, rows: list[int], predictions: list[Prediction]) -> list[str]:
     """A line of the table: number of images, share refused, number by reason, and of the rest the correct share."""
     reasons = Counter(prediction.reason for prediction in predictions if prediction.reason is not None)
     rest = [abs(prediction.alternatives[0].row - number) <= NEAR
             for number, prediction in zip(rows, predictions, strict=True) if prediction.reason is None]  # fmt: skip
-    refused = 100 * (1 - len(rest) / len(rows))
+    refused, correct = 100 * (1 - len(rest) / len(rows)), f"{100 * np.mean(rest):.0f}" if rest else ""
     words = ", ".join(f"{count} {reason}" for reason, count in reasons.items())
-    return f"| {kind} | {len(rows)} | {refused:.0f} | {words} | {f'{100 * np.mean(rest):.0f}' if rest else ''} |"
+    return [kind, f"{len(rows)}", f"{refused:.0f}", words, correct]
 
 
 def run(drives: list[str], features: str) -> None:
     """Print a table for each drive."""
-    system = load_system("mfvpr", features=features)
-    for drive in drives:
-        name, _, paths = drive.partition("=")
-        dataset, rng = folder(*paths.split(":"), ground_truth="order"), np.random.default_rng(0)
-        print(f"\n{name}, {features}\n\n| image | number | refused, % | reasons | of the rest correct, % |")
-        print("| :-- | --: | --: | :-- | --: |")
+    datasets, system = datasets_of(drives), load_system("mfvpr", features=features)
+    for name, dataset in datasets.items():
+        rng, numbers = np.random.default_rng(0), [*range(len(dataset.queries))]
         with tempfile.TemporaryDirectory() as root:
             known = Map.create(Path(root) / "map", dataset.database, system, cache=FeatureCache())
-            rows = [*range(len(dataset.queries))]
-            print(row("query as it is", rows, [known.localize(dataset.queries.read(number)) for number in rows]))
-            rows = rows[::STEP]
+            unchanged = [known.localize(dataset.queries.read(number)) for number in numbers]
+            lines, numbers = [row("query as it is", numbers, unchanged)], numbers[::STEP]
             for kind, change in CHANGES.items():
-                changed = [to_image(change(dataset.queries.read(number).astype(float), rng)) for number in rows]
-                print(row(kind, rows, [*map(known.localize, changed)]), flush=True)
-
-
-def add_arguments(parser: Parser) -> None:
-    """Declare the command line."""
-    parser.add_argument("drives", nargs="+", metavar="NAME=DATABASE:QUERIES", help="drives")
-    parser.add_argument("--features", default="aliked", help="of system=mfvpr: aliked or sift")
-    parser.set_defaults(run="experiments.unusable:run")
+                changed = [to_image(change(dataset.queries.read(number).astype(float), rng)) for number in numbers]
+                lines.append(row(kind, numbers, [*map(known.localize, changed)]))
+        header = ["image", "number", "refused, %", "reasons", "of the rest correct, %"]
+        print(f"\n{name}, {features}\n\n{Table(header, lines).markdown()}", end="", flush=True)
 
 
 if __name__ == "__main__":
-    run_command("python -m experiments.unusable", str(__doc__), add_arguments)
+    main("unusable", __doc__)

@@ -53,27 +53,39 @@ def check_scorer(
 
 def _check(scorer: Scorer, image_size: tuple[int, int], num_keypoints: int | None, seed: int) -> None:
     _check_is_value(scorer)
-    pairs = [
-        _random_matches(np.random.default_rng([seed, count]), count, image_size, num_keypoints or 3 * count)
-        for count in COUNTS
-    ]
+    pairs = [_random_matches(seed, count, image_size, num_keypoints or 3 * count) for count in COUNTS]
     scorer = fit_capacities(scorer, pairs[0].image_size0, pairs[0].image_size1)
     scores = np.array([_check_scalar(scorer, pair, count) for pair, count in zip(pairs, COUNTS, strict=True)])
     close = partial(_assert_close, TOLERANCE * float(np.abs(scores).max()))
     score_of = scorer if on_host(scorer) else jax.jit(lambda pair: scorer(pair))
     for pair, score in zip(pairs, scores, strict=True):
         close(score_of(pair), score, "jit scores otherwise than without; use jax.numpy on matches")
-        _check_padding(score_of, pair, score, close)
-        _check_order(score_of, pair, score, close)
+        for garbage in (np.inf, -1e30, 7.0):
+            fix = "take values by mfvpr.masked(values, matches.mask)"
+            close(score_of(_pad(pair, garbage, SLOTS)), score, f"padding that holds {garbage} changes the score; {fix}")
+        fix = "count with matches.mask, not with the number of slots"
+        close(score_of(_pad(pair, np.nan, SLOTS + 16)), score, f"more slots of padding change the score; {fix}")
+        order = np.random.default_rng(1).permutation(SLOTS)
+        shuffled = replace(pair, mask=pair.mask[order], **{n: values[order] for n, values in per_match(pair).items()})
+        broken = "the order of the matches, and where padding stands among them, changes the score"
+        close(score_of(shuffled), score, broken)
     batch = jax.tree.map(lambda *leaves: np.stack(leaves), *pairs)
     close(score_candidates(scorer, batch), scores, "vmap over a batch of pairs does not score as the pairs one by one")
     if on_host(scorer):
         return
-    _check_one_trace(scorer, pairs[-1], close)
+    if not holds_function(scorer):  # a scorer that holds a function is compiled at every call
+        _check_one_trace(scorer, pairs[-1], close)
     gradients = jax.jit(_gradients(scorer))
     with suppress(NoGradientError):
         for pair in pairs:
-            _check_gradients(type(scorer).__name__, gradients, pair)
+            of_numbers, of_entries = gradients(pair)
+            named = [(f"a number of {type(scorer).__name__}", gradient) for gradient in of_numbers]
+            for entry, gradient in (*named, *of_entries.items()):
+                if not np.isfinite(gradient).all():
+                    raise AssertionError(
+                        f"the gradient for {entry} is not finite with {pair.mask.sum()} matches: mask values before "
+                        "any arithmetic, not its result, and use mfvpr.safe_sqrt for lengths"
+                    )
 
 
 def _check_is_value(scorer: Any) -> None:
@@ -92,10 +104,10 @@ def _check_is_value(scorer: Any) -> None:
 
 
 def _check_scalar(scorer: Scorer, pair: Matches, count: int) -> np.ndarray:
-    score = scorer(pair)
-    shape, dtype = np.shape(score), jnp.asarray(score).dtype
-    if shape != () or dtype != jnp.float32:
-        raise AssertionError(f"expected a scalar of float32, got shape {shape} of {dtype} for {count} matches")
+    score = jnp.asarray(scorer(pair))
+    if score.shape != () or score.dtype != jnp.float32:
+        got = f"shape {score.shape} of {score.dtype}"
+        raise AssertionError(f"expected a scalar of float32, got {got} for {count} matches")
     if not np.isfinite(score):
         raise AssertionError(
             f"the score of {count} matches is {score}: padding holds NaN, so take values by mfvpr.masked(values, "
@@ -106,26 +118,6 @@ def _check_scalar(scorer: Scorer, pair: Matches, count: int) -> np.ndarray:
     return np.asarray(score)
 
 
-def _check_padding(scorer: Scorer, pair: Matches, score: np.ndarray, close: Callable[..., None]) -> None:
-    for garbage in (np.inf, -1e30, 7.0):
-        close(
-            scorer(_pad(pair, garbage, SLOTS)),
-            score,
-            f"padding that holds {garbage} changes the score; take values by mfvpr.masked(values, matches.mask)",
-        )
-    close(
-        scorer(_pad(pair, np.nan, SLOTS + 16)),
-        score,
-        "more slots of padding change the score; count with matches.mask, not with the number of slots",
-    )
-
-
-def _check_order(scorer: Scorer, pair: Matches, score: np.ndarray, close: Callable[..., None]) -> None:
-    order = np.random.default_rng(1).permutation(len(pair.mask))
-    shuffled = replace(pair, mask=pair.mask[order], **{n: values[order] for n, values in per_match(pair).items()})
-    close(scorer(shuffled), score, "the order of the matches, and where padding stands among them, changes the score")
-
-
 def _check_one_trace(scorer: Scorer, pair: Matches, close: Callable[..., None]) -> None:
     traces = []
 
@@ -134,8 +126,6 @@ def _check_one_trace(scorer: Scorer, pair: Matches, close: Callable[..., None]) 
         traces.append(1)
         return scorer(pair)
 
-    if holds_function(scorer):
-        return  # a scorer that holds a function is compiled at every call
     for factor in (1.0, 1.01, 1.02):
         changed = jax.tree.map(lambda leaf: leaf * factor if _is_floating(leaf) else leaf, scorer)  # noqa: B023
         expected = changed(pair)
@@ -164,16 +154,6 @@ def _gradients(scorer: Any) -> Callable[[Matches], tuple[list[Array], dict[str, 
     return gradients
 
 
-def _check_gradients(name: str, gradients: Callable[[Matches], Any], pair: Matches) -> None:
-    of_numbers, of_entries = gradients(pair)
-    for entry, gradient in [*((f"a number of {name}", gradient) for gradient in of_numbers), *of_entries.items()]:
-        if not np.isfinite(gradient).all():
-            raise AssertionError(
-                f"the gradient for {entry} is not finite with {pair.mask.sum()} matches: mask values before any "
-                "arithmetic, not its result, and use mfvpr.safe_sqrt for lengths"
-            )
-
-
 def _assert_close(tolerance: float, got: Any, expected: Any, broken: str) -> None:
     got, expected = np.asarray(got), np.asarray(expected)
     if got.shape != expected.shape or not (np.abs(got - expected) <= tolerance).all():
@@ -184,9 +164,9 @@ def _is_floating(leaf: Any) -> bool:
     return not callable(leaf) and jnp.issubdtype(jnp.result_type(leaf), jnp.floating)
 
 
-def _random_matches(rng: np.random.Generator, count: int, image_size: tuple[int, int], num_keypoints: int) -> Matches:
+def _random_matches(seed: int, count: int, image_size: tuple[int, int], num_keypoints: int) -> Matches:
     """Matches of one pair, half of them with the same shift; padding holds NaN."""
-    size = np.array(image_size, np.float32)
+    rng, size = np.random.default_rng([seed, count]), np.array(image_size, np.float32)
     points0, anywhere = (rng.uniform(0, size, (count, 2)) for _ in range(2))
     points1 = np.where(rng.random((count, 1)) < 0.5, np.clip(points0 + size / 9, 0, size - 1), anywhere)
     points1[-1:] = points0[-1:]  # the length of a shift of 0 has no gradient
@@ -194,20 +174,18 @@ def _random_matches(rng: np.random.Generator, count: int, image_size: tuple[int,
     entries = [np.asarray(values, np.float32) for values in (points0, points1, *unit)]
     points0, points1, distance, scores0, scores1, ratio, confidence = entries
     indices = (rng.permutation(num_keypoints)[:count].astype(np.int32) for _ in range(2))
-    counts = np.full(2, num_keypoints, np.int32)
-    real = np.ones(count, bool)
+    counts, real = np.full(2, num_keypoints, np.int32), np.ones(count, bool)
     pair = Matches(points0, points1, distance, scores0, scores1, real, size, size, ratio, confidence, *indices, *counts)
     return _pad(pair, np.nan, SLOTS)
 
 
 def _pad(pair: Matches, garbage: float, slots: int) -> Matches:
     """Move the real matches to the front of `slots` slots, and fill the rest with `garbage`."""
-    real = np.asarray(pair.mask)
-    count = int(real.sum())
+    real, count = np.asarray(pair.mask), int(np.sum(pair.mask))
 
     def pad(values: np.ndarray) -> np.ndarray:
-        is_integer = np.issubdtype(values.dtype, np.integer)
-        rows = np.full((slots, *values.shape[1:]), np.int32(-1) if is_integer else np.float32(garbage))
+        fill = -1 if np.issubdtype(values.dtype, np.integer) else garbage
+        rows = np.full((slots, *values.shape[1:]), fill, values.dtype)
         rows[:count] = values[real]
         return rows
 

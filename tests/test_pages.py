@@ -16,7 +16,7 @@ from mfvpr.utils.fields import settings_of
 from notebooks.draw_results import draw, query_times, real_recall
 from tests import programs
 from tests.needs import needs
-from tests.programs import QUICK, ROOT, run, typed
+from tests.programs import QUICK, ROOT, typed
 
 pytestmark = needs("experiments")
 
@@ -94,16 +94,6 @@ def test_code_runs(page, small_street, tmp_path):
     assert done.returncode == 0, done.stderr
     if page == README:
         assert {"run", "map", "report.html"} <= {path.name for path in tmp_path.iterdir()}
-
-
-@pytest.mark.slow
-def test_benchmark_runs(tmp_path):
-    out = tmp_path / "benchmark.json"
-    done = run("--rounds", "1", "--out", out, program="benchmark")
-    assert done.returncode == 0, done.stderr
-    for step in ("matching, 50 x 700 x 512", "1 queries to rankings", "histogram, 50 pairs"):
-        assert re.search(rf"^{step} +mfvpr", done.stdout, flags=re.MULTILINE)
-    assert out.is_file()
 
 
 @pytest.mark.parametrize("page", PAGES)

@@ -3,7 +3,7 @@
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from functools import cache, partial
-from typing import Any, NamedTuple
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -12,6 +12,7 @@ from flax import nnx
 
 import mfvpr
 from experiments.benchmark import networks
+from experiments.benchmark.harness import Rows
 from mfvpr.baselines.scorers import SCORERS
 from mfvpr.core.nearest import products
 from mfvpr.core.types import Features, Matches
@@ -27,53 +28,35 @@ GRIDS = {
     mfvpr.HistogramOfShifts(): {"sigma": [5.0, 22.5], "weight": ["fs", "dmf"], "max_distance": [0.5, 1.2]},
     mfvpr.AnchorPoints(): {"window": [4.0, 10.0], "tolerance": [1.0, 3.0]},
 }
-SMOOTH = {  # scorers with a gradient, and the share by which it may deviate
-    mfvpr.HistogramOfShifts(temperature=0.5, max_bins=48): 1e-4, mfvpr.AnchorPoints(temperature=0.1): 5e-3,
-    mfvpr.AggregatedScore(temperature=2.0): 1e-4,
-}  # fmt: skip
+# Scorers with a gradient, and the share by which it may deviate.
+SMOOTH = {mfvpr.HistogramOfShifts(temperature=0.5, max_bins=48): 1e-4, mfvpr.AggregatedScore(temperature=2.0): 1e-4}
+SMOOTH[mfvpr.AnchorPoints(temperature=0.1)] = 5e-3
 NETWORKS = {  # checkpoint -> side of the images in px, result; weights are random unless they are installed
-    networks.ALIKED[0]: (320, lambda model, images: model.levels(images / 255)[1]),
+    networks.ALIKED: (320, lambda model, images: model.levels(images / 255)[1]),
     networks.D2NET: (336, lambda model, images: model(preprocess(images, "caffe"))),
     networks.MIXVPR: (320, lambda model, images: model(model.preprocess(images))),
 }
 
 
-class Check(NamedTuple):
-    """A check: `compute` returns the device's result and its reference, which deviate by a share `allowed` at most.
-
-    It may return how many entries differ, without ties of float32.
-    """
-
-    what: str
-    compute: Callable[[], tuple[Any, ...]]
-    allowed: float = 1e-5
+# What is checked; a function that returns the device's result, its reference, and maybe how many entries differ without
+# ties of float32; and the share by which results may deviate.
+Check = tuple[str, Callable[[], tuple[Any, ...]], float]
 
 
-def check_all(*, is_small: bool) -> list[dict[str, Any]]:
+def check_all(_: int) -> Rows:
     """Rows of all checks; several run at the same time, since most of the time is compiling."""
-    all_checks = [*matching_checks(), *scoring_checks(), *search_checks(), *network_checks(is_small=is_small)]
-    return list(ordered_map(check, all_checks, workers=available_cpus()))
+    checks = [*matching_checks(), *scoring_checks(), *search_checks(), *network_checks()]
+    return list(ordered_map(check, checks, workers=available_cpus()))
 
 
 def check(task: Check) -> dict[str, Any]:
     """Row of a check: the greatest deviation, relative to the largest entry of the reference."""
-    result, expected, differ = (*task.compute(), 0)[:3]
+    what, compute, allowed = task
+    result, expected, differ = (*compute(), 0)[:3]
     result, expected = (np.asarray(values, np.float64) for values in (result, expected))
     deviation = float(np.max(np.abs(result - expected)) / (np.max(np.abs(expected)) or 1.0))  # NaN is not exact
-    is_exact = "yes" if deviation <= task.allowed and not differ else "NO"
-    return {"what": task.what, "deviation": deviation, "allowed": task.allowed, "differ": differ, "exact": is_exact}
-
-
-def beside_float64(function: Callable[..., Any], *inputs: Any) -> tuple[Any, Any]:
-    """Results of a function on the device, and on the CPU with all numbers in float64."""
-
-    def widen(leaf: Any) -> Any:
-        array = np.asarray(leaf)
-        return array.astype(np.float64) if array.dtype == np.float32 else array
-
-    result, cpu = np.asarray(function(*jax.device_put(inputs))), jax.devices("cpu")[0]
-    with jax.enable_x64(True), jax.default_device(cpu), jax.numpy_dtype_promotion("standard"):
-        return result, np.asarray(function(*jax.tree.map(widen, inputs)))
+    is_exact = "yes" if deviation <= allowed and not differ else "NO"
+    return {"what": what, "exact": is_exact, "deviation": deviation, "allowed": allowed, "differ": differ}
 
 
 @cache
@@ -99,31 +82,43 @@ def matches(**options: Any) -> Matches:
         return jax.tree.map(np.asarray, mfvpr.match_candidates(*images(), **options))
 
 
+def beside_float64(what: str, function: Callable[..., Any], *inputs: Any, allowed: float = 1e-5) -> Check:
+    """Check results of a function on the device beside those on the CPU with all numbers in float64."""
+
+    def widen(leaf: Any) -> Any:
+        array = np.asarray(leaf)
+        return array.astype(np.float64) if array.dtype == np.float32 else array
+
+    def compute() -> tuple[Any, ...]:
+        result, cpu = np.asarray(function(*jax.device_put(inputs))), jax.devices("cpu")[0]
+        with jax.enable_x64(True), jax.default_device(cpu), jax.numpy_dtype_promotion("standard"):
+            return result, np.asarray(function(*jax.tree.map(widen, inputs)))
+
+    return what, compute, allowed
+
+
 def matching_checks() -> Iterator[Check]:
     """Products and matches."""
     for product in ("bfloat16", "float32"):
-        yield Check(f"matches, {product}", partial(match, images(), product))
-    query, candidate = images()[0].descriptors, images()[1].descriptors[0]
-    expected = query.astype(np.float64) @ candidate.astype(np.float64).T
-    yield Check("products of descriptors", lambda: (jax.jit(products)(query, candidate), expected), 1e-6)
+        yield f"matches, {product}", partial(match, images(), product), 1e-5
+    descriptors = images()[0].descriptors, images()[1].descriptors[0]
+    yield beside_float64("products of descriptors", jax.jit(products), *descriptors, allowed=1e-6)
 
 
 def match(images: tuple[Features, Features], product: Any = None, rounded: Any = None) -> tuple[Any, ...]:
     """Distances and ratios of matches, and how many keypoints have another match than `images` in float64."""
     on_device = mfvpr.match_candidates(*(rounded or images), with_ratio=True, product=product, chunk_size=1)
     result = jax.tree.map(np.asarray, on_device)
-    neighbors, references = np.where(result.mask, result.index1, -1), []
-    query, rows = images[0].descriptors.astype(np.float64), np.arange(neighbors.shape[1])
-    for candidate in images[1].descriptors.astype(np.float64):
-        similarity = query @ candidate.T
-        *_, second, nearest = np.argsort(similarity, axis=1).T
-        *_, second0, largest0 = np.sort(similarity, axis=0)
-        distance, to_second = (np.linalg.norm(query - candidate[index], axis=1) for index in (nearest, second))
-        is_tie = (similarity[rows, nearest] - similarity[rows, second] < TIE) | (largest0 - second0 < TIE)[nearest]
-        expected = np.where(similarity.argmax(0)[nearest] == rows, nearest, -1)
-        references.append((expected, is_tie, distance, distance / to_second))
-    expected, is_tie, *numbers = (np.stack(values) for values in zip(*references, strict=True))
+    query, candidates = (side.descriptors.astype(np.float64) for side in images)
+    similarity = query @ candidates.swapaxes(1, 2)  # [C, N0, N1]
+    nearest, (second, largest) = similarity.argmax(2), np.moveaxis(np.sort(similarity, axis=2)[..., -2:], 2, 0)
+    second0, largest0 = (np.sort(similarity, axis=1)[:, rank] for rank in (-2, -1))
+    back, gap0 = (np.take_along_axis(each, nearest, 1) for each in (similarity.argmax(1), largest0 - second0))
+    expected = np.where(back == np.arange(len(query)), nearest, -1)
+    neighbors, is_tie = np.where(result.mask, result.index1, -1), (largest - second < TIE) | (gap0 < TIE)
     compared = (neighbors == expected) & (neighbors >= 0) & ~is_tie
+    distance, to_second = (np.sqrt(2 - 2 * each) for each in (largest, second))
+    numbers = [distance, distance / to_second]
     differ = int(np.sum((neighbors != expected) & ~is_tie))
     return np.where(compared, [result.distance, result.ratio], 0), np.where(compared, numbers, 0), differ
 
@@ -134,13 +129,12 @@ def scoring_checks() -> Iterator[Check]:
     for name, scorer in SCORERS.items():
         if not hasattr(scorer, "score_pairs"):  # those are on the host
             scorer, of = (scorer(side=SIDE), cells) if name == "grid" else (scorer(), pairs)
-            yield Check(f"score {name}", partial(beside_float64, partial(mfvpr.score_candidates, scorer), of))
+            yield beside_float64(f"score {name}", partial(mfvpr.score_candidates, scorer), of)
     for scorer, axes in GRIDS.items():
-        compute = partial(beside_float64, partial(mfvpr.score_grid, scorer, **axes), pairs)
-        yield Check(f"grid of {type(scorer).__name__}", compute)
+        yield beside_float64(f"grid of {type(scorer).__name__}", partial(mfvpr.score_grid, scorer, **axes), pairs)
     for scorer, allowed in SMOOTH.items():
-        compute = partial(beside_float64, jax.jit(partial(_gradient, scorer)), *images())
-        yield Check(f"gradient of {type(scorer).__name__}", compute, allowed)
+        gradient = jax.jit(partial(_gradient, scorer))
+        yield beside_float64(f"gradient of {type(scorer).__name__}", gradient, *images(), allowed=allowed)
 
 
 def _gradient(scorer: Any, query: Features, candidates: Features) -> jax.Array:
@@ -166,23 +160,21 @@ def search_checks() -> Iterator[Check]:
     expected = -np.sort(-similarity, axis=1)[:, :50]
 
     def search(shortlist: Callable[..., Any]) -> tuple[Any, ...]:
-        candidates = shortlist(queries, database, num_candidates=50)
-        similarities = np.take_along_axis(similarity, np.asarray(candidates.indices), axis=1)
-        return candidates.scores, expected, int(np.sum(np.abs(similarities - expected) > TIE))
+        """Scores, and similarities of the rows in float64."""
+        found = shortlist(queries, database, num_candidates=50)
+        similarities = np.take_along_axis(similarity, np.asarray(found.indices), axis=1)
+        return np.stack([found.scores, similarities]), np.stack([expected] * 2)
 
     for name, function in (("retrieve", mfvpr.retrieve), ("ExactSearch", ExactSearch().shortlist)):
-        yield Check(f"search, {name}", partial(search, function), 2e-6)
+        yield f"search, {name}", partial(search, function), TIE
 
 
-def network_checks(*, is_small: bool) -> Iterator[Check]:
-    """Networks on one image; the small check is of ALIKED alone."""
+def network_checks() -> Iterator[Check]:
+    """Networks on one image; on a CPU ALIKED alone, on a small one."""
+    is_small = jax.default_backend() == "cpu"
     for checkpoint, (side, function) in [*NETWORKS.items()][: 1 if is_small else None]:
-        compute = partial(_network, checkpoint, 64 if is_small else side, function)
-        yield Check(f"{checkpoint}, random weights", compute, 1e-4)  # TF32 deviates by more
-
-
-def _network(checkpoint: str, side: int, function: Callable[..., Any]) -> tuple[Any, Any]:
-    images = np.random.default_rng(0).uniform(0, 255, (1, side // 8, side // 8, 3)).repeat(8, axis=1).repeat(8, axis=2)
-    graph, state = nnx.split(networks.make_network(checkpoint)[0])
-    run = jax.jit(lambda state, images: function(nnx.merge(graph, state), images))
-    return beside_float64(run, state, images.astype(np.float32))
+        cells = np.random.default_rng(0).uniform(0, 255, (1, *[(64 if is_small else side) // 8] * 2, 3))
+        graph, state = nnx.split(networks.make_network(checkpoint)[0])
+        run = jax.jit(lambda state, images, graph=graph, function=function: function(nnx.merge(graph, state), images))
+        image = cells.repeat(8, axis=1).repeat(8, axis=2).astype(np.float32)
+        yield beside_float64(checkpoint, run, state, image, allowed=1e-4)  # TF32 deviates by more

@@ -3,13 +3,16 @@
 import json
 import platform
 import time
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from functools import cache
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
 import jax
 import numpy as np
 
+from mfvpr.checkpoints import REGISTRY, is_installed
 from mfvpr.cli.console import progress
 from mfvpr.report import Table
 from mfvpr.utils.files import write_text
@@ -17,54 +20,34 @@ from mfvpr.utils.fingerprints import versions
 from mfvpr.utils.numerics import available_cpus
 
 Entry = tuple[str, str, Callable[[], Any]]  # step, implementation, the call that is timed
-Results = Mapping[tuple[str, str], Any]  # (step, implementation) -> result of the first call
+Rows = list[dict[str, Any]]  # of a table, by column
 
 QUICK, REPEATED = 0.05, 10  # seconds; untimed calls at most
 
 
-def compete(
-    entries: Sequence[Entry],
-    rounds: int,
-    out: Path,
-    *,
-    title: str,
-    remarks: Callable[[Results], Iterable[str]] | None = None,
-) -> Results:
-    """Time entries, print a table below the title, and write it as JSON to `out`."""
-    rows, table, results = measure(entries, rounds)
-    write_report(out, title, [table, *(remarks(results) if remarks else [])], {"rounds": rounds, "results": rows})
-    return results
-
-
-def measure(entries: Sequence[Entry], rounds: int) -> tuple[list[dict[str, Any]], Table, Results]:
-    """Time entries in turns after a first call, which compiles; the table compares with each step's first entry.
+def measure(entries: Sequence[Entry], rounds: int) -> Rows:
+    """Time entries in turns after a first call, which compiles; each step is compared with its first entry.
 
     Calls of a few milliseconds are repeated untimed before each timed one: other implementations have just emptied the
     caches, and their idle threads may still be spinning.
     """
-    results, first_calls, seconds = {}, {}, {(step, name): list[float]() for step, name, _ in entries}
-    for step, name, call in progress("warm-up", entries):
-        start = time.perf_counter()
-        results[step, name] = call()
-        first_calls[step, name] = time.perf_counter() - start
+    first = {(step, name): duration(call) for step, name, call in progress("warm-up", entries)}
+    seconds = {entry: list[float]() for entry in first}
     for _ in progress("rounds", range(rounds)):
         for step, name, call in entries:
             times = seconds[step, name]
             for _ in range(min(REPEATED, int(QUICK / times[-1])) if times else 0):
                 call()
             times.append(duration(call))
-    steps, medians = [step for step, _ in seconds], {entry: float(np.median(times)) for entry, times in seconds.items()}
-    rows, lines = [], []
-    for step, name in sorted(seconds, key=lambda entry: (steps.index(entry[0]), medians[entry])):
-        low, median, high = (1e3 * float(np.quantile(seconds[step, name], share)) for share in (0.25, 0.5, 0.75))
-        reference = next(entry for entry in seconds if entry[0] == step)
-        ratio, first = medians[step, name] / medians[reference], first_calls[step, name]
-        rows.append(
-            {"step": step, "name": name, "median_ms": median, "quartiles_ms": [low, high], "first_call_s": first}
-        )
-        lines.append([step, name, f"{median:.2f}", f"{low:.2f} .. {high:.2f}", f"{ratio:.2f}", f"{first:.1f}"])
-    header = ["step", "implementation", "median, ms", "quartiles, ms", "/ mfvpr", "first call, s"]
-    return rows, Table(header, lines, text_columns=2), results
+    rows, medians = [], {entry: float(np.median(times)) for entry, times in seconds.items()}
+    for step in dict.fromkeys(step for step, _ in seconds):
+        names = [name for other, name in seconds if other == step]
+        for name in sorted(names, key=lambda name: medians[step, name]):
+            low, median, high = (1e3 * float(np.quantile(seconds[step, name], share)) for share in (0.25, 0.5, 0.75))
+            row = {"step": step, "implementation": name, "median, ms": median, "quartiles, ms": [low, high]}
+            ratio = medians[step, name] / medians[step, names[0]]
+            rows.append(row | {"/ mfvpr": ratio, "first call, s": first[step, name]})
+    return rows
 
 
 def duration(call: Callable[[], Any]) -> float:
@@ -79,12 +62,50 @@ def ready(function: Callable[..., Any], *inputs: Any, **options: Any) -> Callabl
     return lambda: jax.block_until_ready(function(*inputs, **options))
 
 
-def write_report(out: Path, title: str, parts: Iterable[Table | str], content: Mapping[str, Any]) -> None:
-    """Print tables and remarks below a title, and write the remarks and `content` as JSON to `out`."""
-    parts = list(parts)
+@cache
+def torch_or_none() -> Any:
+    """Torch, whose products are of float32 without TF32; None if it is missing, or lacks JAX's device."""
+    if find_spec("torch") is None:
+        return None
+    import torch
+
+    torch.set_flush_denormal(True)  # as XLA does; far bins are denormal floats, which make torch four times as slow
+    torch.backends.cuda.matmul.allow_tf32 = torch.backends.cudnn.allow_tf32 = False
+    torch.backends.cudnn.benchmark = True
+    return torch if jax.default_backend() == "cpu" or torch.cuda.is_available() else None
+
+
+def ready_torch(function: Callable[..., Any], *inputs: Any, **options: Any) -> Callable[[], Any]:
+    """Call of torch that waits for its result."""
+    torch = torch_or_none()
+
+    def call() -> Any:
+        with torch.inference_mode():
+            result = function(*inputs, **options)
+        if jax.default_backend() != "cpu":
+            torch.cuda.synchronize()
+        return result
+
+    return call
+
+
+def write_report(out: Path, groups: Mapping[str, Rows]) -> None:
+    """Print the last of the groups, and write all as JSON to `out`."""
     machine = {"device": jax.devices()[0].device_kind, "cores": available_cpus(), "processor": platform.machine()}
-    remarks = [part for part in parts if isinstance(part, str)]
-    common = {"machine": machine, "versions": versions(), "remarks": remarks}
-    write_text(out, json.dumps(common | dict(content), indent=1) + "\n")
-    texts = (part if isinstance(part, str) else part.text() for part in parts)
-    print(f"\n{title}; {machine}\n", *texts, f"results: {out}", sep="\n", flush=True)
+    torch = torch_or_none()
+    about = versions() | ({"torch": torch.__version__} if torch else {})
+    weights = [name for name, entry in REGISTRY.items() if is_installed(entry)]  # others are random
+    content = {"machine": machine, "versions": about, "published weights": weights, "groups": dict(groups)}
+    write_text(out, json.dumps(content, indent=1) + "\n")
+    title, rows = [*groups.items()][-1]
+    lines = [[*map(_cell, row.values())] for row in rows]
+    print(f"\n{title}; {machine}; published weights: {', '.join(weights) or 'none'}\n")
+    print(Table([*rows[0]], lines, text_columns=2), f"results: {out}", sep="\n", flush=True)
+
+
+def _cell(value: Any) -> str:
+    if isinstance(value, list):
+        return " .. ".join(map(_cell, value))
+    if isinstance(value, float):
+        return f"{value:.2f}" if value >= 0.1 else f"{value:.2g}"
+    return f"{value:,}" if isinstance(value, int) else str(value)

@@ -1,12 +1,12 @@
 """Networks in plain torch, with the keys of the published weights.
 
-A network is a function of its weights and of RGB images `[B, 3, H, W]`, 0 .. 255. Results are on the host. Deformable
-convolutions use `grid_sample`.
+A network is a function of its weights and of RGB images `[B, 3, H, W]`, 0 .. 255. Features and descriptors are on the
+host. Deformable convolutions use `grid_sample`.
 """
 
 from collections.abc import Callable, Iterable, Mapping
-from functools import cache
-from typing import Any, NamedTuple
+from functools import cache, partial
+from typing import Any
 
 import numpy as np
 import torch
@@ -39,26 +39,10 @@ def run_network(
 ) -> list[Any]:
     """Results of a network for each image of RGB batches `[B, H, W, 3]` uint8."""
     results = []
-    with torch.inference_mode():
-        for batch in batches:
-            images = torch.from_numpy(batch).to(device).permute(0, 3, 1, 2).contiguous(memory_format=layout)
-            results.extend(network(weights, images))
-    if device == "cuda":
-        torch.cuda.synchronize()
+    for batch in batches:
+        images = torch.from_numpy(batch).to(device).permute(0, 3, 1, 2).contiguous(memory_format=layout)
+        results.extend(network(weights, images))
     return results
-
-
-class LocalFeatures(NamedTuple):
-    """Features of one image."""
-
-    keypoints: np.ndarray  # [n, 2] (x, y), px
-    descriptors: np.ndarray  # [n, D]
-    scores: np.ndarray  # [n]
-
-
-def to_host(*tensors: Tensor) -> LocalFeatures:
-    """Copy keypoints, descriptors and scores of an image to the host."""
-    return LocalFeatures(*(tensor.cpu().numpy() for tensor in tensors))
 
 
 def conv(w: Weights, name: str, x: Tensor, *, bias: bool = False, **options: int) -> Tensor:
@@ -84,13 +68,9 @@ def linear(w: Weights, name: str, x: Tensor) -> Tensor:
     return F.linear(x, w(f"{name}.weight"), w(f"{name}.bias"))
 
 
-_BGR_MEAN = (103.939, 116.779, 123.68)
-_EDGE = (5 + 1) ** 2 / 5
-
-
 def d2net_map(w: Weights, images: Tensor) -> Tensor:
     """Dense maps `[B, 512, h, w]`: VGG16 to conv4_3 with stride 4; the mean is subtracted in float64, as published."""
-    mean = torch.tensor(_BGR_MEAN, dtype=torch.float64, device=images.device)
+    mean = torch.tensor((103.939, 116.779, 123.68), dtype=torch.float64, device=images.device)
     x = (images.flip(1) - mean[:, None, None]).float()
     for position in (0, 2, 5, 7, 10, 12, 14, 17, 19, 21):  # of the convolutions
         x = F.relu(x, inplace=True) if position else x
@@ -101,38 +81,6 @@ def d2net_map(w: Weights, images: Tensor) -> Tensor:
         reach = 2 if position >= 17 else 1
         x = conv(w, f"dense_feature_extraction.model.{position}", x, bias=True, padding=reach, dilation=reach)
     return F.relu(x, inplace=True)
-
-
-def d2net(w: Weights, images: Tensor) -> list[LocalFeatures]:
-    """Features at the maxima of the dense map over channels and neighborhoods."""
-    dense = d2net_map(w, images)
-    di, dj, dii, djj, dij = _derivatives(dense)
-    det, trace = dii * djj - dij * dij, dii + djj
-    strongest = dense == dense.amax(1, keepdim=True)
-    highest = dense == F.max_pool2d(dense, 3, stride=1, padding=1)
-    detected = strongest & highest & (det > 0) & (trace * trace / det <= _EDGE)
-    steps = torch.stack([(dij * dj - djj * di) / det, (dij * di - dii * dj) / det], -1)
-    return [_local_features(*image) for image in zip(dense, detected, steps, strict=True)]
-
-
-def _derivatives(dense: Tensor) -> tuple[Tensor, ...]:
-    """Derivatives di, dj, dii, djj, dij of maps, zeros outside; shifted maps are faster than convolutions."""
-    wide = F.pad(dense, (1, 1, 1, 1))
-    up, down, left, right = wide[..., :-2, 1:-1], wide[..., 2:, 1:-1], wide[..., 1:-1, :-2], wide[..., 1:-1, 2:]
-    corners = wide[..., 2:, 2:] - wide[..., 2:, :-2] - wide[..., :-2, 2:] + wide[..., :-2, :-2]
-    return (down - up) / 2, (right - left) / 2, up - 2 * dense + down, left - 2 * dense + right, corners / 4
-
-
-def _local_features(dense: Tensor, detected: Tensor, steps: Tensor) -> LocalFeatures:
-    """Refine the positions of one map `[C, h, w]`, and interpolate its descriptors there."""
-    channel, row, column = detected.nonzero(as_tuple=True)
-    step = steps[channel, row, column]
-    position = torch.stack([row, column], 1) + step
-    last = torch.tensor(dense.shape[1:], device=dense.device) - 1
-    inside = ((step.abs() < 0.5) & (position >= 0) & (position <= last)).all(1)
-    position, scores = position[inside].flip(1), dense[channel, row, column][inside]
-    descriptors = sample(dense[None], position[None, None])[0, :, 0]
-    return to_host(4 * position + 1.5, F.normalize(descriptors, dim=0).T, scores)
 
 
 def mixvpr(w: Weights, images: Tensor) -> np.ndarray:
@@ -153,66 +101,48 @@ def resnet(w: Weights, images: Tensor) -> Tensor:
     x = F.max_pool2d(F.relu(batch_norm(w, "backbone.model.bn1", x), inplace=True), 3, stride=2, padding=1)
     for layer, blocks in ((1, 3), (2, 4), (3, 6)):
         for block in range(blocks):
-            stride = 2 if layer > 1 and block == 0 else 1
-            x = _bottleneck(w, f"backbone.model.layer{layer}.{block}", x, stride, shortcut=block == 0)
+            name, stride = f"backbone.model.layer{layer}.{block}", 2 if layer > 1 and block == 0 else 1
+            out = F.relu(batch_norm(w, f"{name}.bn1", conv(w, f"{name}.conv1", x)), inplace=True)
+            out = conv(w, f"{name}.conv2", out, stride=stride, padding=1)
+            out = F.relu(batch_norm(w, f"{name}.bn2", out), inplace=True)
+            out = batch_norm(w, f"{name}.bn3", conv(w, f"{name}.conv3", out))
+            if block == 0:
+                x = batch_norm(w, f"{name}.downsample.1", conv(w, f"{name}.downsample.0", x, stride=stride))
+            x = F.relu(out.add_(x), inplace=True)
     return x
 
 
-def _bottleneck(w: Weights, name: str, x: Tensor, stride: int, shortcut: bool) -> Tensor:
-    out = F.relu(batch_norm(w, f"{name}.bn1", conv(w, f"{name}.conv1", x)), inplace=True)
-    out = conv(w, f"{name}.conv2", out, stride=stride, padding=1)
-    out = F.relu(batch_norm(w, f"{name}.bn2", out), inplace=True)
-    out = batch_norm(w, f"{name}.bn3", conv(w, f"{name}.conv3", out))
-    if shortcut:
-        x = batch_norm(w, f"{name}.downsample.1", conv(w, f"{name}.downsample.0", x, stride=stride))
-    return F.relu(out.add_(x), inplace=True)
-
-
 _RADIUS = 2  # of the detector, px
-_LEVELS = ((1, 1), (2, 2), (4, 8), (4, 32))  # before each block: pooling, and size of the image / size of the map
 
 
-def aliked(w: Weights, images: Tensor, threshold: float) -> list[LocalFeatures]:
-    """Keypoints with sub-pixel positions, and their descriptors; sides of images are divisible by 32."""
+def aliked(w: Weights, images: Tensor, threshold: float = 0.1) -> list[list[np.ndarray]]:
+    """Keypoints `[n, 2]` (x, y) px, descriptors `[n, D]` and scores `[n]`; sides of images are divisible by 32."""
     features, scores = dense_features(w, images)
-    corner = torch.tensor(scores.shape[:1:-1], device=scores.device) - 1  # (width, height) - 1
     extracted = []
     for dense, score, peaks in zip(features, scores, _maxima(scores) > threshold, strict=True):
-        points = (
-            _aliked_refine(score[0], *peaks[0].nonzero(as_tuple=True)) / corner * 2 - 1
-        )  # and back, rounded as published
-        values = F.grid_sample(score[None], points[None, None], align_corners=True)[0, 0, 0]
-        descriptors = _aliked_descriptors(w, dense, (points / 2 + 0.5) * corner)
-        extracted.append(to_host((points + 1) / 2 * corner, descriptors, values))
+        points = _refine(score[0], *peaks[0].nonzero(as_tuple=True))
+        values = sample(score[None], points[None, None])[0, 0, 0]
+        extracted.append([each.cpu().numpy() for each in (points, _deformed_descriptors(w, dense, points), values)])
     return extracted
 
 
 def dense_features(w: Weights, images: Tensor) -> tuple[Tensor, Tensor]:
     """Unit features `[B, D, H, W]` and scores `[B, 1, H, W]`."""
     x, levels = images / 255, []
-    for place, (pooled, factor) in enumerate(_LEVELS, start=1):
-        x = x if pooled == 1 else F.avg_pool2d(x, pooled)
-        x = _aliked_block(w, f"block{place}", x, deformable=place > 2, shortcut=place > 1)
-        level = F.selu(conv(w, f"conv{place}", x), inplace=True)
-        enlarged = {"scale_factor": factor, "mode": "bilinear", "align_corners": True}
-        levels.append(level if factor == 1 else F.interpolate(level, **enlarged))
+    for place, pooled in enumerate((1, 2, 4, 4), start=1):
+        x = F.avg_pool2d(x, pooled) if pooled > 1 else x
+        shortcut = conv(w, f"block{place}.downsample", x, bias=True) if place > 1 else None
+        convolve = _deformable if place > 2 else partial(conv, padding=1)
+        for each in (1, 2):
+            x = batch_norm(w, f"block{place}.bn{each}", convolve(w, f"block{place}.conv{each}", x))
+            x = F.selu(x if each == 1 or shortcut is None else x.add_(shortcut), inplace=True)
+        level, size = F.selu(conv(w, f"conv{place}", x), inplace=True), images.shape[2:]
+        levels.append(F.interpolate(level, size, mode="bilinear", align_corners=True) if place > 1 else level)
     features = torch.cat(levels, 1)
     score = conv(w, "score_head.0", features)
     for position in (2, 4, 6):
         score = conv(w, f"score_head.{position}", F.selu(score, inplace=True), padding=1)
     return F.normalize(features), score.sigmoid()
-
-
-def _aliked_block(w: Weights, name: str, x: Tensor, *, deformable: bool, shortcut: bool) -> Tensor:
-    """Two 3 x 3 convolutions; the shortcut is added before the last SELU."""
-
-    def normalized_conv(place: int, x: Tensor) -> Tensor:
-        of_place = f"{name}.conv{place}"
-        out = _deformable(w, of_place, x) if deformable else conv(w, of_place, x, padding=1)
-        return batch_norm(w, f"{name}.bn{place}", out)
-
-    out = normalized_conv(2, F.selu(normalized_conv(1, x), inplace=True))
-    return F.selu(out.add_(conv(w, f"{name}.downsample", x, bias=True)) if shortcut else out, inplace=True)
 
 
 def _deformable(w: Weights, name: str, x: Tensor) -> Tensor:
@@ -221,20 +151,16 @@ def _deformable(w: Weights, name: str, x: Tensor) -> Tensor:
     limit = max(height, width) / 4
     offsets = conv(w, f"{name}.offset_conv", x, bias=True, padding=1).clamp(-limit, limit).unflatten(1, (9, 2))
     rows, columns = torch.arange(height, device=x.device), torch.arange(width, device=x.device)
-    down, right = (step.reshape(9, 1, 1) for step in _neighborhood(1, x.device))
-    vertical = offsets[:, :, 0] + (rows[:, None] + down)  # [B, 9, h, w]
-    horizontal = offsets[:, :, 1] + (columns + right)
-    taps = sample(x, torch.stack([horizontal, vertical], -1).flatten(1, 2)).unflatten(2, (9, height))
+    right, down = _neighborhood(1, x.device).T[..., None, None]
+    places = torch.stack([offsets[:, :, 1] + (columns + right), offsets[:, :, 0] + (rows[:, None] + down)], -1)
+    taps = sample(x, places.flatten(1, 2)).unflatten(2, (9, height))  # places are [B, 9, h, w, 2]
     products = w(f"{name}.regular_conv.weight").flatten(1) @ taps.flatten(3).flatten(1, 2)
     return products.unflatten(2, (height, width))
 
 
 def _maxima(scores: Tensor) -> Tensor:
     """Scores at maxima of their neighborhoods, in three rounds; 0 elsewhere and along the border."""
-
-    def local_max(values: Tensor) -> Tensor:
-        return F.max_pool2d(values, 2 * _RADIUS + 1, stride=1, padding=_RADIUS)
-
+    local_max = partial(F.max_pool2d, kernel_size=2 * _RADIUS + 1, stride=1, padding=_RADIUS)
     peaks = scores == local_max(scores)
     for _ in range(2):
         suppressed = local_max(peaks.float()) > 0
@@ -244,21 +170,18 @@ def _maxima(scores: Tensor) -> Tensor:
     return scores * peaks * inside
 
 
-def _aliked_refine(score: Tensor, row: Tensor, column: Tensor) -> Tensor:
+def _refine(score: Tensor, row: Tensor, column: Tensor) -> Tensor:
     """Positions `[n, 2]` (x, y) px of peaks, moved by a soft-argmax of their neighborhoods."""
-    down, right = _neighborhood(_RADIUS, score.device)
-    patches = F.pad(score, (_RADIUS,) * 4)[row[:, None] + _RADIUS + down, column[:, None] + _RADIUS + right]
+    steps = _neighborhood(_RADIUS, score.device)
+    patches = score[row[:, None] + steps[:, 1], column[:, None] + steps[:, 0]]  # no peak is near the border
     weights = ((patches - patches.amax(1, keepdim=True)) / 0.1).exp()
-    residual = weights @ torch.stack([right, down], 1).float() / weights.sum(1, keepdim=True)
-    return torch.stack([column, row], 1) + residual
+    return torch.stack([column, row], 1) + weights @ steps.float() / weights.sum(1, keepdim=True)
 
 
-def _aliked_descriptors(w: Weights, features: Tensor, points: Tensor) -> Tensor:
+def _deformed_descriptors(w: Weights, features: Tensor, points: Tensor) -> Tensor:
     """Descriptors `[n, D]` of points `[n, 2]` (x, y) px, sampled where the neighborhood of each point says."""
-    reach = torch.arange(3, device=points.device)
-    column, row = points.long().T
-    padded = F.pad(features, (1, 1, 1, 1))
-    patches = padded[:, (row[:, None] + reach)[:, :, None], (column[:, None] + reach)[:, None]]  # [D, n, 3, 3]
+    column, row = (points.long()[:, None] + _neighborhood(1, points.device) + 1).unbind(2)
+    patches = F.pad(features, (1, 1, 1, 1))[:, row, column].unflatten(2, (3, 3))  # [D, n, 3, 3]
     limit = max(features.shape[1:]) / 4
     offsets = F.selu(conv(w, "desc_head.offset_conv.0", patches.transpose(0, 1), bias=True), inplace=True)
     offsets = conv(w, "desc_head.offset_conv.2", offsets, bias=True).clamp(-limit, limit)
@@ -267,8 +190,7 @@ def _aliked_descriptors(w: Weights, features: Tensor, points: Tensor) -> Tensor:
     return F.normalize(torch.einsum("cnp,pcd->nd", F.selu(mixed, inplace=True), w("desc_head.agg_weights")))
 
 
-def _neighborhood(radius: int, device: torch.device) -> tuple[Tensor, Tensor]:
-    """Offsets down and to the right, row by row."""
+def _neighborhood(radius: int, device: torch.device) -> Tensor:
+    """Steps (right, down) `[n, 2]`, row by row."""
     reach = torch.arange(-radius, radius + 1, device=device)
-    down, right = torch.cartesian_prod(reach, reach).T
-    return down, right
+    return torch.cartesian_prod(reach, reach).flip(1)

@@ -1,17 +1,14 @@
 """Matching, scores and search in torch, as its users would write them, with all pairs of a query in one batch."""
 
 from collections.abc import Sequence
+from typing import Any
 
 import torch
 from torch import Tensor
 
 SIZE, BIN, SIGMA = 336, 15.0, 22.5  # px
+product = torch.matmul
 CELLS, REACH, TOLERANCE = 15, 5, 3.0  # of anchor points: cells per side, half of the window, cells
-
-
-def product(left: Tensor, right: Tensor) -> Tensor:
-    """Matrix product."""
-    return left @ right
 
 
 def match(query: Tensor, candidates: Tensor) -> tuple[Tensor, Tensor]:
@@ -38,10 +35,8 @@ def bin_centers(bin_size: float, device: torch.device | None = None) -> Tensor:
 
 
 def histogram(shifts: Tensor, weights: Tensor, centers: Tensor, sigma: float) -> Tensor:
-    """Tallest bins `[C]` from shifts `[C, K, 2]`, or `[C, W]` of weights `[C, W, K]`, by separable Gaussians."""
+    """Tallest bins `[C, W]` from shifts `[C, K, 2]` and weights `[C, W, K]`, by separable Gaussians."""
     votes_x, votes_y = (torch.exp(-0.5 * ((shifts[:, :, axis, None] - centers) / sigma) ** 2) for axis in (0, 1))
-    if weights.ndim == 2:
-        return torch.matmul((votes_y * weights[:, :, None]).mT, votes_x).amax((1, 2))
     columns = (weights[:, :, None] * votes_y.mT[:, None]).flatten(1, 2)  # [C, W * bins, K]
     return torch.matmul(columns, votes_x).unflatten(1, (weights.shape[1], -1)).amax((2, 3))
 
@@ -69,34 +64,30 @@ def aggregate(shifts: Tensor, weights: Tensor, mask: Tensor) -> Tensor:
     return (weights * ((SIZE - (shifts - mean).abs()) ** 2).sum(2)).sum(1)
 
 
-def score(
-    points0: Tensor, points1: Tensor, scores0: Tensor, scores1: Tensor, distance: Tensor, mask: Tensor, *, scorer: str
-) -> Tensor:
+def match_weights(name: str, fields: Sequence[Tensor], farthest: float = 2.0) -> Tensor:
+    """Weights `[C, K]` of matches by name; 0 for padding and for matches farther apart."""
+    scores0, scores1, distance, mask = fields
+    weights = {"fs": scores0 + scores1, "dmf": 2 - distance, "unit": torch.ones_like(distance)}[name]
+    return torch.where(mask & (distance <= farthest), weights, 0.0)
+
+
+def score(points0: Tensor, points1: Tensor, *fields: Tensor, scorer: str) -> Tensor:
     """Scores `[C]` by the histogram, anchor points or the sum with the paper's weights."""
-    weights = torch.where(mask, 2 - distance if scorer == "sum" else scores0 + scores1, 0.0)
+    weights, shifts = match_weights("dmf" if scorer == "sum" else "fs", fields), points1 - points0
     if scorer == "anchor":
         return anchor(points0, points1, weights)
-    shifts = points1 - points0
     if scorer == "sum":
-        return aggregate(shifts, weights, mask)
-    return histogram(shifts, weights, bin_centers(BIN, mask.device), SIGMA)
+        return aggregate(shifts, weights, fields[-1])
+    return histogram(shifts, weights[:, None], bin_centers(BIN, shifts.device), SIGMA)[:, 0]
 
 
-def grid(
-    shifts: Tensor,
-    weights: Tensor,
-    distance: Tensor,
-    mask: Tensor,
-    *,
-    sigmas: Sequence[float],
-    bin_sizes: Sequence[float],
-    max_distances: Sequence[float],
-) -> Tensor:
-    """Scores of all settings for weights `[C, W, K]`: `[bins * sigmas, C, W * distances]`."""
-    centers, limits = [bin_centers(size, mask.device) for size in bin_sizes], distance.new_tensor(max_distances)
-    near = ((distance[:, None] <= limits[:, None]) & mask[:, None]).float()
-    near_weights = (weights[:, :, None] * near[:, None]).flatten(1, 2)
-    return torch.stack([histogram(shifts, near_weights, c, sigma) for c in centers for sigma in sigmas])
+def grid(points0: Tensor, points1: Tensor, *fields: Tensor, **axes: Sequence[Any]) -> Tensor:
+    """Scores of all settings: `[bin sizes * sigmas, C, weights * distances]`."""
+    names, limits = axes.get("weight", ("fs",)), axes.get("max_distance", (2.0,))
+    weights = torch.stack([match_weights(name, fields, limit) for name in names for limit in limits], 1)
+    shifts = points1 - points0
+    bins = [bin_centers(size, shifts.device) for size in axes["bin_size"]]
+    return torch.stack([histogram(shifts, weights, centers, sigma) for centers in bins for sigma in axes["sigma"]])
 
 
 def search(queries: Tensor, database: Tensor, *, candidates: int) -> Tensor:
@@ -112,6 +103,6 @@ def rank(rows: Tensor, *fields: Tensor) -> Tensor:
         points1, candidates, scores1 = (field[row] for field in fields[3:])
         nearest1, mutual = match(query, candidates)
         weights = torch.where(mutual, scores0 + torch.gather(scores1, 1, nearest1), 0.0)
-        scores = histogram(take(points1, nearest1) - points0, weights, centers, SIGMA)
+        scores = histogram(take(points1, nearest1) - points0, weights[:, None], centers, SIGMA)[:, 0]
         rankings.append(scores.argsort(descending=True))
     return torch.stack(rankings)

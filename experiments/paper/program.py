@@ -1,15 +1,15 @@
-"""The paper's evaluation as a program: every system on every data set at hand, then tables and figures."""
+"""The paper's evaluation as a program: every system on every data set at hand, then tables."""
 
 import shutil
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 from experiments.paper import runs, systems
-from experiments.paper.pages import draw_averages, write_pages
-from experiments.paper.systems import Place, Row
-from experiments.paper.tables import Evaluations, paper_tables, row_result
+from experiments.paper.pages import write_pages
+from experiments.paper.systems import LeftOut, Place, Row
+from experiments.paper.tables import Evaluations, paper_tables, recalls_of
 from mfvpr.checkpoints import how_to_install
 from mfvpr.cli.console import tell
 from mfvpr.cli.jobs import cache_of, dataset_of, describe_truth
@@ -23,56 +23,56 @@ from mfvpr.report.runs import LAST
 from mfvpr.utils.errors import InputError
 from mfvpr.utils.files import expand_user
 
+Folders = dict[tuple[str, str], Path]  # run folders by data set and evaluation
+
 
 def paper(settings: Paper) -> None:
-    """Evaluate what is not evaluated yet, then write tables and figures, and print the recalls."""
+    """Evaluate what is not evaluated yet, then write tables, and print the recalls."""
     rows = systems.chosen_rows(settings.systems)
     places, left_out = systems.places(settings.data, settings.datasets)
     for run in _names(rows) if places else ():
         if missing := systems.missing_weights(runs.settings_of(run, places[0], settings)):
             needs = [f"{entry.name} ({entry.file}): {how_to_install(entry)}" for entry in missing]
-            left_out.append(f"{run}: needs {'; '.join(needs)}")
+            left_out.append((run, f"needs {'; '.join(needs)}"))
             rows = [row for row in rows if row.run != run]
-    for line in left_out:
-        tell(f"left out: {line}")
+    for what, why in left_out:
+        tell(f"left out: {what}: {why}")
     if not places or not rows:
         raise InputError("nothing to evaluate: the lines above say what is missing")
-    names, known = _names(rows), [place.name for place in places]
+    names, out = _names(rows), expand_user(settings.out)
+    folders = [runs.folder_of(run, place.name, settings) for place in places for run in names]
     tell(
-        f"plan: {len(names)} evaluations ({', '.join(names)}) on each of {len(places)} data sets ({', '.join(known)}), "
-        f"{len(_finished_runs(rows, known, settings))} of {len(names) * len(places)} finished; then tables, seconds of "
-        f"a query, and figures in {settings.out}"
+        f"plan: {len(names)} evaluations ({', '.join(names)}) on each of {len(places)} data sets "
+        f"({', '.join(place.name for place in places)}), {sum((folder / LAST).is_file() for folder in folders)} of "
+        f"{len(folders)} finished; then seconds of a query, and tables in {out}"
     )
-    out = expand_user(settings.out)
     with runs.lock_output(out):
-        datasets, failures = evaluate_all(rows, places, settings)
+        datasets, finished, failures = evaluate_all(names, places, settings)
         if not datasets:
-            raise InputError(f"nothing was evaluated: {failures[0]}")
-        evaluations = _read_evaluations(rows, datasets, settings)
-        name = "robotcar_seasons" if "robotcar_seasons" in datasets else next(iter(datasets))
-        about = runs.device()
-        evaluations = replace(evaluations, timed_on=f"{name}, on {about['cores']} cores of {about['device']}")
+            raise InputError(f"nothing was evaluated: {': '.join(failures[0])}")
+        evaluations = read_evaluations(rows, datasets, finished)
+        name, device = "robotcar_seasons" if "robotcar_seasons" in datasets else next(iter(datasets)), runs.device()
+        evaluations = replace(evaluations, timed_on=f"{name}, on {device['cores']} cores of {device['device']}")
         for table_name, heading, table in paper_tables(evaluations):  # before the seconds, which take a while
             if table_name in ("recall", "averages"):
                 print(f"\n{heading}\n\n{table.text()}", end="", flush=True)
-        timed_on = next(place for place in places if place.name == name)
-        times = measure_times(rows, timed_on, datasets[name], settings, out)
+        [timed_on] = (place for place in places if place.name == name)
+        times = {
+            run: _measure_seconds(runs.settings_of(run, timed_on, settings), datasets[name], folder, device)
+            for (dataset, run), folder in finished.items()
+            if dataset == name
+        }
         leading = {row.name: times[row.run] for row in rows if row.run in times and row.leads}
-        _write_output(out, replace(evaluations, seconds=leading), [*left_out, *failures])
+        for table_folder in ("tables", "comparisons"):  # they may have those of other rows and data sets
+            shutil.rmtree(out / table_folder, ignore_errors=True)
+        evaluations = replace(evaluations, seconds=leading)
+        tables = {table_name: (heading, table) for table_name, heading, table in paper_tables(evaluations)}
+        for table_name, (heading, table) in tables.items():
+            write_table(out / "tables", table, heading, name=table_name)
+        write_pages(out, evaluations, tables, [*left_out, *failures])
+        print(f"\ntables: {out}\nreport: {out / PAGE}")
     if failures:
-        raise InputError(f"{len(failures)} of the evaluations could not be made: {failures[0]}")
-
-
-def _write_output(out: Path, evaluations: Evaluations, left_out: Sequence[str]) -> None:
-    for name in ("tables", "figures", "comparisons"):  # they may have those of other rows and data sets
-        shutil.rmtree(out / name, ignore_errors=True)
-    (out / "figures").mkdir()
-    tables = {name: (heading, table) for name, heading, table in paper_tables(evaluations)}
-    for name, (heading, table) in tables.items():
-        write_table(out / "tables", table, heading, name=name)
-    draw_averages(out / "figures" / "averages.png", evaluations)
-    write_pages(out, evaluations, tables, left_out)
-    print(f"\ntables and figures: {out}\nreport: {out / PAGE}")
+        raise InputError(f"{len(failures)} of the evaluations could not be made: {': '.join(failures[0])}")
 
 
 def _names(rows: Sequence[Row]) -> list[str]:
@@ -80,26 +80,27 @@ def _names(rows: Sequence[Row]) -> list[str]:
     return list(dict.fromkeys(row.run for row in rows))
 
 
-def evaluate_all(rows: Sequence[Row], places: Sequence[Place], settings: Paper) -> tuple[dict[str, Dataset], list[str]]:
-    """Evaluate; return readable data sets, and a line per failed evaluation."""
-    names, datasets, failures = _names(rows), dict[str, Dataset](), list[str]()
+def evaluate_all(
+    names: Sequence[str], places: Sequence[Place], settings: Paper
+) -> tuple[dict[str, Dataset], Folders, list[LeftOut]]:
+    """Evaluate; return readable data sets, run folders of finished evaluations, and the failed ones."""
+    datasets, finished, failures = dict[str, Dataset](), Folders(), list[LeftOut]()
 
-    def fail(line: str) -> None:
-        failures.append(line)
-        tell(f"left out: {line}")
+    def fail(what: str, error: InputError) -> None:
+        failures.append((what, str(error)))
+        tell(f"left out: {what}: {error}")
 
     for number, place in enumerate(places):
         try:
             chosen = runs.settings_of(names[0], place, settings)
-            dataset = dataset_of(chosen.dataset)
-            description = describe_truth(chosen.dataset, chosen.recall, dataset)
-            cache = cache_of(chosen)
-            folders = {sequence.name: sequence.images for sequence in dataset.sequences}
-            folders |= {"the database": dataset.database}
-            images = {side: cache.recipes.contents(folder).fingerprint for side, folder in folders.items()}
-            correct = dataset.positives_fingerprint(description.get("thresholds", []))
+            dataset, cache = dataset_of(chosen.dataset), cache_of(chosen)
+            thresholds = describe_truth(chosen.dataset, chosen.recall, dataset).get("thresholds", [])
+            sides = {sequence.name: sequence.images for sequence in dataset.sequences}
+            sides |= {"the database": dataset.database}
+            images = {side: cache.recipes.contents(folder).fingerprint for side, folder in sides.items()}
+            correct = dataset.positives_fingerprint(thresholds)
         except InputError as error:
-            fail(f"{place.name}: {error}")
+            fail(place.name, error)
             continue
         datasets[place.name] = dataset
         for difference in published_differences(dataset):
@@ -112,43 +113,32 @@ def evaluate_all(rows: Sequence[Row], places: Sequence[Place], settings: Paper) 
                 try:
                     runs.evaluate(chosen, inputs)
                 except InputError as error:
-                    fail(f"{run} on {place.name}: {error}")
+                    fail(f"{run} on {place.name}", error)
                     continue
+            finished[place.name, run] = folder
             if not (folder / PAGE).is_file():
                 write_report(folder)
-    return datasets, failures
+    return datasets, finished, failures
 
 
-def _finished_runs(rows: Sequence[Row], datasets: Iterable[str], settings: Paper) -> dict[tuple[str, str], Path]:
-    """Run folders by data set and evaluation."""
-    folders = {(name, run): runs.folder_of(run, name, settings) for name in datasets for run in _names(rows)}
-    return {key: folder for key, folder in folders.items() if (folder / LAST).is_file()}
-
-
-def _read_evaluations(rows: Sequence[Row], datasets: Mapping[str, Dataset], settings: Paper) -> Evaluations:
-    results, sizes, folders = {}, {}, _finished_runs(rows, datasets, settings)
-    for (name, run), folder in folders.items():
+def read_evaluations(rows: Sequence[Row], datasets: Mapping[str, Dataset], finished: Folders) -> Evaluations:
+    """Recalls, settings and sizes of all rows."""
+    evaluations = Evaluations(rows, datasets, {}, folders=finished)
+    for (name, run), folder in finished.items():
         content, size = runs.read_json(folder / LAST), runs.read_json(folder / runs.SIZES)
         for row in (row for row in rows if row.run == run):
-            if result := row_result(row, content):
-                results[row.name, name] = result
+            evaluations.recalls.update(recalls_of(row, name, content))
             if row.leads or row.ranking == RETRIEVAL:  # retrieval alone has no local features
                 of_image = size["descriptor"] + (0 if row.ranking == RETRIEVAL else size["local"])
-                sizes[row.name, name] = of_image * len(datasets[name].database) / 2**20
-    return Evaluations(rows, datasets, results, sizes=sizes, folders=folders)
+                evaluations.sizes[row.name, name] = of_image * len(datasets[name].database) / 2**20
+    return evaluations
 
 
-def measure_times(
-    rows: Sequence[Row], place: Place, dataset: Dataset, settings: Paper, out: Path
-) -> dict[str, dict[str, Any]]:
-    """Seconds by finished evaluation on a data set, measured once for the same settings, data and device."""
-    times = {}
-    for (_, run), folder in _finished_runs(rows, [place.name], settings).items():
-        path = out / "seconds" / f"{run}.json"
-        about = {"data_set": place.name, "of": runs.read_json(folder / runs.INPUTS)} | runs.device()
-        times[run] = runs.read_json(path) or {}
-        if any(times[run].get(name) != value for name, value in about.items()):
-            tell(f"timing: {run} on {place.name}")
-            times[run] = runs.measure_query(runs.settings_of(run, place, settings), dataset) | about
-            write_json(path, times[run])
-    return times
+def _measure_seconds(settings: Any, dataset: Dataset, folder: Path, device: Mapping[str, Any]) -> dict[str, Any]:
+    """Seconds of a query, measured once on a device for a run folder."""
+    seconds = runs.read_json(folder / runs.SECONDS) or {}
+    if seconds.get("measured_on") != device:
+        tell(f"timing: {folder.name} on {dataset.name}")
+        seconds = runs.measure_query(settings, dataset) | {"measured_on": device}
+        write_json(folder / runs.SECONDS, seconds)
+    return seconds

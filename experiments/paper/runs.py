@@ -3,7 +3,7 @@
 import json
 import tempfile
 from collections.abc import Iterator, Mapping
-from contextlib import ExitStack, contextmanager
+from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -17,7 +17,7 @@ from mfvpr.cli.command_line import checked, compose
 from mfvpr.cli.jobs import Inputs
 from mfvpr.cli.schema import Evaluate, Paper
 from mfvpr.datasets import Dataset
-from mfvpr.evaluation import Pipeline, System, rank_dataset
+from mfvpr.evaluation import System, rank_dataset
 from mfvpr.features import PatchNetVladFeatures, SelaVprFeatures, SsmCells
 from mfvpr.report.pages import PAGE
 from mfvpr.report.run_files import ground_truth, write_run_folder
@@ -31,26 +31,22 @@ from mfvpr.utils.files import expand_user, lock_folder
 from mfvpr.utils.fingerprints import fingerprint, versions
 from mfvpr.utils.numerics import available_cpus
 
-INPUTS, SIZES = "made_of.json", "sizes.json"  # see `input_fingerprints` and `bytes_of_an_image`
-_SHARED = ("cache", "memory", "devices")  # settings of both programs
+# See `input_fingerprints`, `bytes_of_an_image` and `measure_query`.
+INPUTS, SIZES, SECONDS = "made_of.json", "sizes.json", "seconds.json"
 _FLOAT, _KEYPOINT = 4, 12  # bytes of a number, and of a keypoint with its score
 _GRIDS = (SsmCells, PatchNetVladFeatures, SelaVprFeatures)
 QUERIES, DATABASE = 10, 60  # images; as many of the database as there are candidates, at least
 STEPS = ("retrieval", "features", "matching", "scores")
-_OUTPUTS = {"runs", "tables", "figures", "comparisons", "seconds", PAGE}
+_OUTPUTS = {"runs", "tables", "comparisons", PAGE}
 _FREE = {"out", "cache", "memory", "devices", "compiled", "cluster"}  # settings that change no number
 
 
 @contextmanager
 def lock_output(out: Path) -> Iterator[None]:
     """Lock a folder for evaluations; an InputError if another process uses it, or if it has files of others."""
-    in_use = InputError(f"out={out}: another process evaluates into it; wait until it ends, or name another folder")
-    with ExitStack() as stack:
-        try:
-            out.mkdir(parents=True, exist_ok=True)
-            stack.enter_context(lock_folder(out, in_use))
-        except OSError as error:
-            raise InputError(f"out={out}: cannot be made ({error.strerror}); name another folder") from error
+    out.mkdir(parents=True, exist_ok=True)
+    in_use = f"out={out}: another process evaluates into it; wait until it ends, or name another folder"
+    with lock_folder(out, InputError(in_use)):
         names = {path.name for path in out.iterdir() if not path.name.startswith(".")}
         if names and not {"runs"} <= names <= _OUTPUTS:  # files of an earlier output are removed
             raise InputError(f"out={out}: expected a new or empty folder, or one of this program; name another")
@@ -60,9 +56,9 @@ def lock_output(out: Path) -> Iterator[None]:
 def settings_of(run: str, place: Place, settings: Paper) -> Evaluate:
     """The checked settings of an evaluation."""
     chosen = [*place.settings, *overrides(run, place.name), "figures=2"]
-    shared = {name: getattr(settings, name) for name in _SHARED}
-    out, command = str(folder_of(run, place.name, settings)), f"mfvpr evaluate {' '.join(chosen)}"
-    return replace(checked("evaluate", compose("evaluate", chosen)), out=out, command=command, **shared)
+    own = {name: getattr(settings, name) for name in ("cache", "memory", "devices")}
+    own |= {"out": str(folder_of(run, place.name, settings)), "command": f"mfvpr evaluate {' '.join(chosen)}"}
+    return replace(checked("evaluate", compose("evaluate", chosen)), **own)
 
 
 def folder_of(run: str, dataset: str, settings: Paper) -> Path:
@@ -139,31 +135,28 @@ def measure_query(settings: Evaluate, dataset: Dataset) -> dict[str, float]:
     """Measure the seconds of a query by step.
 
     A part of the database is enough: only the search among descriptors depends on its size. Queries are evaluated
-    twice under different names, so that nothing is compiled, and no feature of the database is extracted, while the
-    second pass is timed.
+    twice, as files of equal pixels and other bytes: the second pass, which is timed, extracts their features again,
+    but compiles nothing, and extracts no feature of the database.
     """
-    sequence = dataset.sequences[-1]  # RobotCar's snow, as the paper
-    number = min(QUERIES, len(sequence.images))
-    candidates = settings.candidates
+    sequence, candidates = dataset.sequences[-1], settings.candidates  # RobotCar's snow, as the paper
+    paths = sequence.images.paths[:QUERIES]
     least = DATABASE if candidates == "all" else max(DATABASE, candidates)
     database = replace(dataset.database, names=tuple(dataset.database.names[:least]))
-    extractor, matcher = assembly.extractor(settings.features, None), assembly.matcher(settings.matching, None)
-    retriever = assembly.retriever(settings.retrieval, extractor, None)
-    scorers, seconds = assembly.scorers(settings.scorer), dict[str, float]()
-    main = "histogram" if "histogram" in scorers else next(iter(scorers))
+    pipeline, scorers = assembly.pipeline(settings, None), assembly.scorers(settings.scorer)
+    main, seconds = "histogram" if "histogram" in scorers else next(iter(scorers)), dict[str, float]()
     with tempfile.TemporaryDirectory(prefix="mfvpr-timing-") as folder:
         cache = FeatureCache(Path(folder) / "cache")
-        system = System(Pipeline(extractor, retriever, matcher, candidates), {main: scorers[main]})
+        system = System(pipeline, {main: scorers[main]})
         for turn in ("first", "second"):
-            renamed = Path(folder) / turn
-            renamed.mkdir()
-            names = [f"{turn}{row:04d}{path.suffix}" for row, path in enumerate(sequence.images.paths[:number])]
-            for name, path in zip(names, sequence.images.paths, strict=False):
-                (renamed / name).symlink_to(path.absolute())
-            images = replace(sequence.images, root=renamed, names=tuple(names))
+            root = Path(folder) / turn
+            root.mkdir()
+            names = tuple(f"{turn}{row:04d}{path.suffix}" for row, path in enumerate(paths))
+            for name, path in zip(names, paths, strict=True):
+                (root / name).write_bytes(path.read_bytes() + turn.encode())  # readers ignore what follows an image
+            images = replace(sequence.images, root=root, names=names)
             part = replace(sequence, images=images, truth=None, excluded=None)
             seconds = rank_dataset(Dataset(dataset.name, database, (part,)), system, cache=cache).seconds
-    return {step: seconds.get(step, 0.0) / number for step in STEPS}
+    return {step: seconds.get(step, 0.0) / len(paths) for step in STEPS}
 
 
 def device() -> dict[str, Any]:

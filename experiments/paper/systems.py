@@ -17,8 +17,8 @@ from mfvpr.utils.files import expand_user
 
 DRAWN = "streets_seasons"
 REAL = {"grief_season": ("database", "queries"), "corridor": ("ref", "query")}  # data sets, and their folders
-_SIDES = ("database", "queries")
-_POSITIONS = "@"  # begins image names that hold coordinates: @easting@northing@...
+
+LeftOut = tuple[str, str]  # what is left out, and why
 
 
 @dataclass(frozen=True)
@@ -54,56 +54,52 @@ ROWS = tuple(Row(name, **{"run": name, **values}) for name, values in _SYSTEMS["
 def overrides(run: str, dataset: str) -> tuple[str, ...]:
     """Settings of `mfvpr evaluate` that make an evaluation, without its data set."""
     chosen = _SYSTEMS["evaluations"].get(run, [f"system={run}"])
-    if run.startswith("patch_netvlad") and dataset == "robotcar_seasons":
-        size = ("scorer.size=[400,400]",) if run == "patch_netvlad_speed" else ()  # of the patches' grid
-        return (*chosen, "features.image_size=[480,480]", *size)
-    return (*chosen,)
+    return (*chosen, *_SYSTEMS["data_sets"].get(dataset, {}).get(run, ()))
 
 
 def chosen_rows(names: Sequence[str] | None) -> tuple[Row, ...]:
     """Rows by name, in the order of the tables; all for None."""
-    _check_names("systems", names, [row.name for row in ROWS])
-    return tuple(row for row in ROWS if names is None or row.name in names)
+    chosen = _chosen("systems", names, [row.name for row in ROWS])
+    return tuple(row for row in ROWS if row.name in chosen)
 
 
-def _check_names(setting: str, names: Sequence[str] | None, known: Sequence[str]) -> None:
+def _chosen(setting: str, names: Sequence[str] | None, known: Sequence[str]) -> list[str]:
     if unknown := [name for name in names or () if name not in known]:
         raise InputError(f"{setting}=[{unknown[0]}]: expected some of {', '.join(known)}")
+    return [name for name in known if names is None or name in names]
 
 
-def places(data: str | None, names: Sequence[str] | None) -> tuple[list[Place], list[str]]:
-    """The data sets that are at hand, and a line for each that is not, with the reason."""
+def places(data: str | None, names: Sequence[str] | None) -> tuple[list[Place], list[LeftOut]]:
+    """The data sets that are at hand, and those that are not, with the reason."""
     root = None if data is None else expand_user(data)
     if root is not None and not root.is_dir():
         raise InputError(f"data={data}: expected a folder with a folder per data set; check the path")
     located = {place.name: place for place in _places_by_coordinates(root)} if root else {}
-    known = list(dict.fromkeys((DRAWN, *REAL, *PUBLISHED, *located)))
-    _check_names("datasets", names, known)
-    available, left_out = list[Place](), list[str]()
-    for name in known if names is None else [name for name in known if name in names]:
+    available, left_out = list[Place](), list[LeftOut]()
+    for name in _chosen("datasets", names, list(dict.fromkeys((DRAWN, *REAL, *PUBLISHED, *located)))):
         folders = PUBLISHED[name].folders if name in PUBLISHED else (name,)
         present = [root / folder for folder in folders if root and folder not in located and (root / folder).is_dir()]
         if name == DRAWN:
             available.append(Place(name, (f"dataset={name}",)))
         elif name in located and (name in (*REAL, *PUBLISHED) or not DATA_SET_NAME.holds(name)):
             expected = f"{DATA_SET_NAME.expected}, and not that of a published data set"
-            left_out.append(f"{name}: expected a name of {expected}, for a folder of images with positions; rename it")
+            left_out.append((name, f"expected a name of {expected}, for a folder of images with positions; rename it"))
         elif name in located:
             available.append(located[name])
         elif present:
             available.append(Place(name, (f"dataset={name}", override("dataset.root", present[0]))))
         else:
             needs = f"with {' and '.join(REAL[name])}" if name in REAL else f"({PUBLISHED[name].source})"
-            left_out.append(f"{name}: needs {data or 'data=DIR'}/{name} {needs}")
+            left_out.append((name, f"needs {data or 'data=DIR'}/{name} {needs}"))
     return available, left_out
 
 
 def _places_by_coordinates(root: Path) -> Iterator[Place]:
-    """Folders of images whose names hold coordinates, as VPR-datasets-downloader makes them."""
+    """Folders of images whose names `@easting@northing@...` hold coordinates, as VPR-datasets-downloader makes them."""
     for folder in sorted(path for path in root.iterdir() if path.is_dir()):
         for inside in (folder, folder / "images" / "test"):
-            sides = {side: inside / side for side in _SIDES}
-            if all(any(path.is_file() for path in side.glob(f"{_POSITIONS}*")) for side in sides.values()):
+            sides = {side: inside / side for side in ("database", "queries")}
+            if all(any(path.is_file() for path in side.glob("@*")) for side in sides.values()):
                 chosen = {"name": folder.name, **sides, "ground_truth": "utm"}
                 settings = (override(f"dataset.{name}", value) for name, value in chosen.items())
                 yield Place(folder.name, ("dataset=folder", *settings))

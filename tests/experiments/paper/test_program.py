@@ -66,7 +66,7 @@ def files(out):
     """Contents that do not depend on the time: every file but the seconds; results.json without its seconds."""
     contents = {}
     for path in sorted(path for path in out.rglob("*") if path.is_file()):
-        if path.parent.name == "seconds" or path.stem in ("run", "seconds", "report"):
+        if path.stem in ("run", "seconds", "report"):
             continue
         content = path.read_bytes()
         if path.name == "results.json":
@@ -82,11 +82,10 @@ def test_it_names_what_is_left_out_prints_recalls_and_links_every_page(finished,
     assert left_out[1].startswith("left out: mix_hist_10: needs d2_tf")
     assert "SIFT-hist 10" in process.stdout
     assert "Mix-hist 10" not in process.stdout
-    assert process.stdout.endswith(f"tables and figures: {out}\nreport: {out}/report.html\n")
+    assert process.stdout.endswith(f"tables: {out}\nreport: {out}/report.html\n")
     assert sorted(path.stem for path in (out / "tables").glob("*.md")) == [
-        "averages", "data_sets", "depths", "recall", "seconds", "settings", "sizes",
+        "averages", "data_sets", "depths", "recall", "seconds", "sizes",
     ]  # fmt: skip
-    assert [path.name for path in (out / "figures").iterdir()] == ["averages.png"]
     page = (out / "report.html").read_text()
     assert f"{data}/gardens_point (http" in page
     assert "d2_tf (d2_tf.pth)" in page
@@ -95,20 +94,10 @@ def test_it_names_what_is_left_out_prints_recalls_and_links_every_page(finished,
     assert "SIFT-hist 10" in page
 
 
-def test_runs_of_a_data_set_stand_side_by_side(copy, paper):
-    (copy / RUN / "report.html").unlink()
-    (copy / "tables/sequences_other.md").touch()
-    paper(copy, "systems=[sift_hist_10,sift_hist_50]")
-    assert "sift_50" in (copy / "comparisons/grief_season.html").read_text()
-    assert not (copy / "tables/sequences_other.md").exists()
-    assert '<a href="comparisons/grief_season.html">' in (copy / "report.html").read_text()
-    assert (copy / RUN / "report.html").is_file()
-
-
-def test_seconds_of_something_else_are_measured_again(copy, paper):
-    path = copy / "seconds/sift_10.json"
+def test_seconds_of_another_device_are_measured_again(copy, paper):
+    path = copy / RUN / "seconds.json"
     seconds = json.loads(path.read_text())
-    path.write_text(json.dumps(seconds | {"matching": 77.0, "of": seconds["of"] | {"images": "others"}}))
+    path.write_text(json.dumps(seconds | {"matching": 77.0, "measured_on": {"device": "another"}}))
     _, stderr = paper(copy)
     assert "timing: sift_10 on grief_season" in stderr
     assert json.loads(path.read_text())["matching"] < 70
@@ -123,19 +112,25 @@ def test_two_do_not_evaluate_into_one_folder(finished, paper):
     assert "another process evaluates into it" in stderr
 
 
-def test_data_sets_with_positions_in_their_names_are_evaluated(data, tmp_path, paper):
+def test_data_sets_with_positions_are_evaluated_and_runs_stand_side_by_side(data, tmp_path, paper):
     for side, east in (("database", 0), ("queries", 3)):
-        folder = tmp_path / "data" / "my-town" / "images" / "test" / side
+        folder = tmp_path / "data/my-town/images/test" / side
         folder.mkdir(parents=True)
         for row, image in enumerate(sorted((data / "grief_season" / side).iterdir())):
             shutil.copy(image, folder / f"@{500000 + 100 * row + east}@4600000@{row}@.png")
     shutil.copytree(tmp_path / "data/my-town", tmp_path / "data/my town")
-    chosen = "systems=[sift_hist_10]", "datasets=[my-town,my town]"
+    (tmp_path / "out/tables").mkdir(parents=True)
+    for name in ("tables/sequences_other.md", "runs"):
+        (tmp_path / "out" / name).mkdir()
+    chosen = "systems=[sift_hist_10,sift_hist_50]", "datasets=[my-town,my town]"
     stdout, stderr = paper(tmp_path / "out", *chosen, data=tmp_path / "data")
     assert "left out: my town: " in stderr
     assert "my-town ±25" in stdout
-    assert (tmp_path / "out/runs/my-town/sift_10/results.json").is_file()
-    assert '<a href="runs/my-town/sift_10/report.html">' in (tmp_path / "out/report.html").read_text()
+    assert not (tmp_path / "out/tables/sequences_other.md").exists()
+    assert "sift_50" in (tmp_path / "out/comparisons/my-town.html").read_text()
+    links = re.findall(r'<li><a href="([^"#]+)">', (tmp_path / "out/report.html").read_text())
+    assert links == ["comparisons/my-town.html", *(f"runs/my-town/{run}/report.html" for run in ("sift_50", "sift_10"))]
+    assert all((tmp_path / "out" / link).is_file() for link in links)
 
 
 def test_finished_runs_are_not_repeated(finished, paper):
@@ -170,7 +165,7 @@ def test_runs_of_other_inputs_in_the_same_folder_are_errors(copy, data, tmp_path
     assert "a finished run of other" in stderr
 
 
-def test_mistakes_are_one_line(tmp_path, paper):
+def test_mistakes_are_one_line(data, tmp_path, paper):
     for change, words in (
         ("systems=[best]", "systems=[best]: expected some of"),
         ("datasets=[gardens_point]", "nothing to evaluate"),
@@ -179,11 +174,8 @@ def test_mistakes_are_one_line(tmp_path, paper):
         [line] = [line for line in stderr.splitlines() if line.startswith("error: ")]
         assert words in line
     assert not (tmp_path / "out").exists()
-
-
-def test_a_data_set_of_another_layout_is_left_out(data, tmp_path, paper):
     both = shutil.copytree(data, tmp_path / "data")
-    (both / "gardens_point").mkdir()
+    (both / "gardens_point").mkdir()  # of another layout
     stdout, stderr = paper(tmp_path / "out", data=both, code=2)
     assert "left out: gardens_point: " in stderr
     assert "could not be made: gardens_point" in stderr

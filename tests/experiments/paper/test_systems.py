@@ -6,10 +6,9 @@ from pathlib import Path
 import pytest
 
 from experiments.paper import systems
-from experiments.paper.pages import mean_recalls
 from experiments.paper.runs import input_fingerprints, lock_output, settings_of
 from experiments.paper.systems import DRAWN, ROWS, Place, missing_weights, places
-from experiments.paper.tables import OVERALL, Evaluations, RowResult, beside, paper_tables, printed_tables, row_result
+from experiments.paper.tables import OVERALL, Evaluations, beside, paper_tables, printed_tables, recalls_of
 from mfvpr.cli.schema import Paper
 from mfvpr.datasets import Dataset, FrameTruth, ImageFolder, QuerySequence
 from mfvpr.utils.errors import InputError
@@ -46,7 +45,8 @@ def test_every_evaluation_has_settings_of_the_paper(run):
 
 
 def test_settings_depend_on_the_data_set(tmp_path):
-    assert compose("patch_netvlad_speed", "robotcar_seasons", tmp_path).features["image_size"] == [480, 480]
+    speed = compose("patch_netvlad_speed", "robotcar_seasons", tmp_path)
+    assert (speed.features["image_size"], speed.scorer["size"]) == ([480, 480], [400, 400])
     assert compose("sift_50").recall.tolerances == [1, 2, 5]
     assert compose("sift_50", "nordland_27592", tmp_path).recall.tolerances == [10]
 
@@ -58,8 +58,8 @@ def test_data_sets_are_found_by_their_names(tmp_path):
     assert [place.name for place in available] == [DRAWN, "corridor", "gardens_point"]
     assert f"dataset.root='{tmp_path}/Gardens_point_RAS2020'" in available[2].settings
     assert len(left_out) == 12
-    assert left_out[0] == f"grief_season: needs {tmp_path}/grief_season with database and queries"
-    assert [line for line in left_out if line.startswith("msls_val: needs ") and "https://" in line]
+    assert left_out[0] == ("grief_season", f"needs {tmp_path}/grief_season with database and queries")
+    assert "https://" in dict(left_out)["msls_val"]
     available, left_out = places(None, ["corridor", DRAWN])
     assert ([place.name for place in available], len(left_out)) == ([DRAWN], 1)
     for arguments, words in (((None, ["x"]), "datasets"), ((str(tmp_path / "no"), None), "expected a folder")):
@@ -76,7 +76,7 @@ def test_folders_with_positions_in_image_names_are_data_sets(tmp_path):
     assert [place.name for place in available] == [DRAWN, "other", "pitts30k"]
     settings = " ".join(available[2].settings).replace("'", "")
     assert f"dataset.database={tmp_path}/pitts30k/images/test/database" in settings
-    assert [line for line in left_out if line.startswith("pitts30k_test: needs ")]
+    assert dict(left_out)["pitts30k_test"].startswith("needs ")
 
 
 def test_weights_that_are_missing_are_named(monkeypatch):
@@ -114,20 +114,18 @@ def test_a_folder_with_files_of_others_is_refused(tmp_path):
 
 # Tables
 
-MIX = next(row for row in ROWS if row.name == "mix_hist_50")
-TOLERANCES = (1, 2, 5)
+MIX, ANCHOR, SIFT = (
+    next(row for row in ROWS if row.name == name) for name in ("mix_hist_50", "sift_anchor", "sift_hist_50")
+)
 
 
-def result(system, recall, *, decides=False, **more):
-    return {"system": system, "recall_at": {"1": recall, "5": 0.9, "10": 1.0}, "decides": decides, "tolerance": 1,
-            "retrieval": {"name": "vlad"}, "features": {"name": "sift", "image_size": [336, 320]}, "candidates": 50,
-            "parameters": {}} | more  # fmt: skip
-
-
-def row_results(recalls, sequences=(OVERALL,)):
+def recalls(row, dataset, values, sequences=(OVERALL,)):
     """Recalls at 1 within each tolerance, the same in each sequence."""
-    recall = {at: {1: value} for at, value in zip(TOLERANCES, recalls, strict=True)}
-    return RowResult(dict.fromkeys(sequences, recall), result("histogram", 0.5))
+    return {
+        (row.name, dataset, name, at, 1): value
+        for name in sequences
+        for at, value in zip((1, 2, 5), values, strict=True)
+    }
 
 
 def make_dataset(name, *sequences, database=10):
@@ -135,73 +133,85 @@ def make_dataset(name, *sequences, database=10):
     return Dataset(name, folder, tuple(QuerySequence(sequence, folder, None) for sequence in sequences or [name]))
 
 
-def tables_of(evaluations):
+def tables_of(rows, datasets, values, **more):
+    evaluations = Evaluations(rows, {dataset.name: dataset for dataset in datasets}, values, **more)
     return {name: table for name, _, table in paper_tables(evaluations)}
 
 
 def test_a_rows_ranking_is_taken_from_its_evaluation():
+    systems = {"retrieval": 0.1, "histogram": 0.2, "histogram + retrieval": 0.3}
+    results = [{"system": system, "decides": system == "histogram", "tolerance": 1, "recall_at": {"1": recall}}
+               for system, recall in systems.items()]  # fmt: skip
     rows = {row.name: row for row in ROWS}
-    results = [result("retrieval", 0.1), result("histogram", 0.2, decides=True), result("histogram + retrieval", 0.3)]
-    recall = {name: row_result(rows[name], results).recall[OVERALL][1][1]
-              for name in ("mixvpr", "mix_hist_50", "sift_hist_50", "sift_hist_comb_50")}  # fmt: skip
-    assert recall == pytest.approx({"mixvpr": 10, "mix_hist_50": 20, "sift_hist_50": 20, "sift_hist_comb_50": 30})
-    assert row_result(rows["sift_anchor"], results) is None
+    expected = {"mixvpr": 10, "mix_hist_50": 20, "sift_hist_50": 20, "sift_hist_comb_50": 30}
+    for name, recall in expected.items():
+        assert recalls_of(rows[name], "x", results) == {(name, "x", OVERALL, 1, 1): pytest.approx(recall)}
+    assert recalls_of(ANCHOR, "x", results) == {}
 
 
 def test_of_several_sequences_the_plain_mean_counts():
-    results = [result("histogram", value, decides=True, sequence=name)
+    results = [{"decides": True, "sequence": name, "radius": 25, "recall_at": {"5": value}}
                for name, value in (("dawn", 0.1), ("dusk", 0.4), ("mean", 0.25), ("pooled", 0.3))]  # fmt: skip
-    recall = row_result(MIX, results).recall
-    assert {name: at[1][1] for name, at in recall.items()} == {"dawn": 10, "dusk": 40, OVERALL: 25}
+    by_sequence = {name: recall for (_, _, name, _, _), recall in recalls_of(MIX, "x", results).items()}
+    assert by_sequence == {"dawn": 10, "dusk": 40, OVERALL: 25}
 
 
 def test_tables_hold_both_numbers():
     assert (beside(None, 84.0), beside(None, None)) == ("(84.0)", "-")
-    recall = {at: {1: value, 5: 95.0, 10: 99.0} for at, value in ((1, 81.0), (2, 92.5), (5, 96.0))}
-    key = "mix_hist_50", "gardens_point"
-    tables = tables_of(Evaluations(
-        [MIX], {"gardens_point": make_dataset("gardens_point", database=200)},
-        {key: RowResult({OVERALL: recall}, result("histogram", 0.8))}, sizes={key: 200.0},
-        seconds={"mix_hist_50": dict(retrieval=0.1, features=0.2, matching=0.3, scores=0.1)},
-    ))  # fmt: skip
-    assert tables["recall"].rows == [["Mix-hist 50", "81.0 (80.0, +1.0)", "92.5 (92.0, +0.5)", "96.0 (96.0, +0.0)"]]
-    assert tables["data_sets"].rows == [["gardens_point", "200 (200, +0)", "200 (200, +0)"]]
-    assert tables["sizes"].rows == [["Mix-hist 50", "200.0"]]
+    known = {(MIX.name, "gardens_point", OVERALL, at, k): value for at, first in ((1, 81.0), (2, 92.5), (5, 96.0))
+             for k, value in ((1, first), (5, 95.0), (10, 99.0))}  # fmt: skip
+    pittsburgh = {(MIX.name, "pitts30k_val", OVERALL, 25, k): value for k, value in ((1, 80.0), (5, 90.0), (10, 91.0))}
+    datasets = make_dataset("gardens_point", database=200), make_dataset("pitts30k_val")
+    seconds = {MIX.name: dict(retrieval=0.1, features=0.2, matching=0.3, scores=0.1)}
+    sizes = {(MIX.name, "gardens_point"): 200.0}
+    tables = tables_of([MIX, SIFT], datasets, known | pittsburgh, sizes=sizes, seconds=seconds)
+    first = ["Mix-hist 50", "81.0 (80.0, +1.0)", "92.5 (92.0, +0.5)", "96.0 (96.0, +0.0)"]
+    assert [row[:4] for row in tables["recall"].rows] == [first]
+    assert tables["data_sets"].rows[0] == ["gardens_point", "200 (200, +0)", "200 (200, +0)"]
+    assert tables["sizes"].rows == [["Mix-hist 50", "200.0", "-"]]
     cells = ["0.100 (0.010, +0.090)", "0.200 (0.030, +0.170)", "0.400 (0.070, +0.330)", "0.700 (0.100, +0.600)"]
     assert tables["seconds"].rows == [["Mix-hist 50", *cells]]
     assert tables["averages"].rows[0][1:4] == ["(87.5)", "(92.9)", "(95.0)"]
-    assert tables["averages"].header[4:] == [f"of 1 here ±{tolerance}" for tolerance in TOLERANCES]
-    assert tables["depths"].header[1:] == [f"gardens_point ±2 R@{k}" for k in (1, 5, 10)]
-    assert tables["depths"].rows == [["Mix-hist 50", "92.5", "95.0", "99.0"]]
-    assert tables["settings"].rows == [
-        ["Mix-hist 50", "vlad", "- (320 x 320)", "sift", "336 x 320 (320 x 320)", "50 (10 or 50)"]
+    assert tables["averages"].header[4:] == [f"of 1 here ±{tolerance}" for tolerance in (1, 2, 5)]
+    depths = [f"gardens_point ±2 R@{k}" for k in (1, 5, 10)] + [
+        f"pitts30k_val (incomplete) ±25 R@{k}" for k in (1, 5, 10)
+    ]
+    assert tables["depths"].header[1:] == depths
+    assert tables["depths"].rows[0][1:4] == ["92.5 (92.0, +0.5)", "95.0", "99.0"]
+    printed = printed_tables()["pitts30k"][MIX.name]
+    assert [cell.partition(",")[0] for cell in tables["depths"].rows[0][4:]] == [
+        f"{ours} ({theirs}" for ours, theirs in zip((80.0, 90.0, 91.0), printed, strict=True)
     ]
 
 
 def test_sequences_have_a_table_of_their_own():
-    results = {("mix_hist_50", "robotcar_seasons"): row_results([90.0] * 3, ["night", "snow", OVERALL])}
-    dataset = make_dataset("robotcar_seasons", "night", "snow")
-    evaluations = Evaluations([MIX], {"robotcar_seasons": dataset}, results)
-    [line] = tables_of(evaluations)["sequences_robotcar_seasons"].rows
+    values = recalls(MIX, "robotcar_seasons", [90.0] * 3, ["night", "snow", OVERALL])
+    [line] = tables_of([MIX], [make_dataset("robotcar_seasons", "night", "snow")], values)[
+        "sequences_robotcar_seasons"
+    ].rows
     assert line[1:4] == ["90.0 (82.0, +8.0)", "90.0 (89.6, +0.4)", "90.0 (93.4, -3.4)"]
     assert line[7:] == ["90.0 (92.8, -2.8)", "90.0 (96.9, -6.9)", "90.0 (98.5, -8.5)"]
 
 
 def test_averages_over_all_six_are_the_papers():
-    recalls = printed_tables()["recall"]["mix_hist_50"]
-    results = {("mix_hist_50", name): row_results(values) for name, values in recalls.items()}
-    evaluations = Evaluations([MIX], {name: make_dataset(name) for name in recalls}, results)
-    [line] = tables_of(evaluations)["averages"].rows
-    assert [cell.split(" ")[0] for cell in line[1:4]] == ["87.5", "92.9", "95.0"]
-    assert all(cell.endswith("+0.0)") or cell.endswith("-0.0)") for cell in line[1:4])
-    assert line[4:] == []
-    assert [*mean_recalls(evaluations).values()] == 2 * [{MIX.title: pytest.approx(92.875)}]
+    printed, values = printed_tables()["recall"][MIX.name], {}
+    for name, each in printed.items():
+        values |= recalls(MIX, name, each)
+    lines = tables_of([MIX, ANCHOR], [*map(make_dataset, printed)], values)["averages"].rows
+    assert [cell.split(" ")[0] for cell in lines[0][1:4]] == ["87.5", "92.9", "95.0"]
+    assert all(cell.endswith(("+0.0)", "-0.0)")) for cell in lines[0][1:4])
+    assert (len(lines), lines[0][4:]) == (1, [])
+    for name in printed:
+        values |= recalls(ANCHOR, name, [50.0] * 3)
+    del values[MIX.name, "gardens_point", OVERALL, 1, 1]
+    lines = tables_of([MIX, ANCHOR], [*map(make_dataset, printed)], values)["averages"].rows
+    assert [line[1:] for line in lines] == [["(87.5)", "(92.9)", "(95.0)"], ["50.0"] * 3]
 
 
 def test_rows_that_lack_a_data_set_have_no_mean():
-    names, rows = ("corridor", "grief_season"), [row for row in ROWS if row.name in ("sift_hist_50", "sift_anchor")]
-    results = {(row.name, name): row_results([50.0] * 3) for row in rows for name in names}
-    del results["sift_anchor", "corridor"]
-    evaluations = Evaluations(rows, {name: make_dataset(name) for name in names}, results)
-    assert [*mean_recalls(evaluations).values()] == [{"SIFT-hist 50": 50.0}]
-    assert tables_of(evaluations)["averages"].rows == [["SIFT-hist 50", "-", "-", "-", "50.0", "50.0", "50.0"]]
+    names = "corridor", "grief_season"
+    values = recalls(ANCHOR, names[0], [70.0] * 3)
+    for name in names:
+        values |= recalls(SIFT, name, [50.0] * 3)
+    averages = tables_of([SIFT, ANCHOR], [*map(make_dataset, names)], values)["averages"]
+    assert averages.rows == [["SIFT-hist 50", "-", "-", "-", "50.0", "50.0", "50.0"]]
