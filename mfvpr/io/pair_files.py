@@ -229,8 +229,9 @@ QUERY, PREDICTIONS, POSITIVES = "Query path:", "Predictions paths:", "Positives 
 _NAMES = ("img0_path", "img1_path")  # vismatch's
 _LAYOUTS = (("points0", "points1", "confidence"), ("matched_kpts0", "matched_kpts1", "matched_confidences"))
 _INLIERS = ("inlier_kpts0", "inlier_kpts1", "")
+_NUMBERED = ("keypoints0", "keypoints1", "matches", "match_confidence")  # SuperGlue's
 _SIZES = ("image_size0", "image_size1", "im_size")  # the last: side of vismatch's square images
-_PARTS = {*_NAMES, *chain(*_LAYOUTS), *_INLIERS, *_SIZES}
+_PARTS = {*_NAMES, *chain(*_LAYOUTS), *_INLIERS, *_NUMBERED, *_SIZES}
 
 
 def open_results(path: Path, names: tuple[Sequence[str], Sequence[str]], verified: bool = False) -> PairFiles:
@@ -334,5 +335,18 @@ def _matches_of(file: Path, result: Mapping[str, Any], verified: bool) -> FileMa
     for first, second, confidence in (_INLIERS,) if verified else _LAYOUTS:
         if first in parts and second in parts:
             return FileMatches(parts[first], parts[second], parts.get(confidence), sizes)
+    if not verified and {*_NUMBERED[:3]} <= parts.keys():
+        points0, points1, numbers, confidence = (parts.get(name) for name in _NUMBERED)
+        real = numbers >= 0
+        lengths = {points0.shape[0], len(numbers), len(numbers if confidence is None else confidence)}
+        if len(lengths) > 1 or numbers.dtype.kind not in "iu" or (numbers[~real] != -1).any():
+            raise InputError(
+                f"{file}: expected matches [N] of keypoints0 [N, 2], a row of keypoints1 or -1, got others"
+            )
+        if real.any() and numbers.max() >= len(points1):
+            raise InputError(f"{file}: expected matches below the {len(points1)} keypoints1, got {numbers.max()}")
+        return FileMatches(
+            points0[real], points1[numbers[real]], None if confidence is None else confidence[real], sizes
+        )
     expected = " and ".join(_INLIERS[:2]) if verified else "points0 and points1, or matched_kpts0 and matched_kpts1"
     raise InputError(f"{file}: expected {expected}, got {shorten(', '.join(sorted(parts))) or 'none'}")

@@ -35,7 +35,7 @@ from mfvpr.utils.runtime import DEFAULT_RUNTIME, Runtime, Stopwatch, ordered_map
 DECODERS = ("opencv-python-headless", "pillow")  # their versions decide which pixels an image file becomes
 # Version of mfvpr that last changed the pixels of decoded or resized images. If `mfvpr.datasets.image_reading` gives
 # other pixels, set it to the next version: stored features are then extracted again.
-DECODING = "0.3.0"
+DECODING = "0.3.1"
 AGGREGATED = 16  # images at a time
 
 Value = TypeVar("Value")

@@ -13,6 +13,8 @@ from mfvpr.io import Images, containers, open_features, open_matches
 from tests.io.checks import one_line_error
 from tests.io.match_files import DATABASE, GOLDEN, POINTS, QUERIES, SIZE, npz_folder, pair_of, side, write_hloc
 
+SUPERGLUE = {"keypoints0": POINTS, "keypoints1": POINTS[::-1] + 1, "matches": np.array([2, -1, 0])}
+
 
 def tool_sides(tools=None):
     """Images with prefixes as in the tools' files; with hloc's features if `tools` is given."""
@@ -145,6 +147,15 @@ def test_npz_of_points(tmp_path):
             pair_of(npz_folder(tmp_path, points0=POINTS, points1=POINTS, **size))
 
 
+def test_npz_of_superglue(tmp_path):
+    """A partner for each keypoint of the first image, -1 = none."""
+    arrays = SUPERGLUE | {"match_confidence": np.float32([0.5, 0, 0.25])}
+    matches = pair_of(npz_folder(tmp_path, **arrays), image_size=(640, 480))
+    np.testing.assert_array_equal(matches.points0, POINTS[[0, 2]])
+    np.testing.assert_array_equal(matches.points1, POINTS[[0, 2]] + 1)
+    np.testing.assert_array_equal(matches.confidence, np.float32([0.5, 0.25]))
+
+
 def test_names_of_files_with_several_readings_are_refused(tmp_path):
     folder = npz_folder(tmp_path, "a_b_c.npz", points0=POINTS, points1=POINTS)
     with one_line_error("one pair of images, got several"):
@@ -181,6 +192,8 @@ def test_confidences_of_all_pairs_or_of_none(tmp_path):
         ({"points0": POINTS, "points1": POINTS, "im_size": "large"}, "im_size"),
         ({"points0": POINTS, "points1": POINTS, "image_size0": [64, 64]}, "image_size0 and image_size1"),
         ({"points0": POINTS, "points1": POINTS, "im_size": 128}, "the argument image_size="),
+        (SUPERGLUE | {"match_confidence": [0.5, 0.5]}, r"expected matches \[N\]"),
+        *((SUPERGLUE | {"matches": each}, "expected matches") for each in ([0, 1], [3, -1, 0], [-2, 0, 1])),
     ],
 )
 def test_arrays_that_are_no_matches(tmp_path, arrays, message):
