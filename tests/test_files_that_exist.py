@@ -18,7 +18,7 @@ WEIGHT = LearnedWeight.create(jax.random.key(1), random_matches(np.random.defaul
 def test_files_that_exist_stay(tmp_path):
     """Only files of weights and of confidences are replaced, by their like."""
     names, single = ["1.jpg"], np.ones((1, 1))
-    model = Confidence(5, (0.0, 0.0), (1.0, 1.0), (1.0, 1.0), 0.0)
+    model = Confidence((0.0, 0.0), (1.0, 1.0), (1.0, 1.0), 0.0)
     writers = {
         "a.h5": lambda path: io.write_features(path, names, [(0, feature(0))]),
         "a": lambda path: io.write_features(path, names, [(0, feature(0))]),
@@ -49,7 +49,7 @@ def test_files_that_exist_stay(tmp_path):
 
 def test_confidences_and_weights(tmp_path):
     path = tmp_path / "confidence.json"
-    model = Confidence(5, (0.0, 0.0), (1.0, 1.0), (1.0, 1.0), 0.0)
+    model = Confidence((0.0, 0.0), (1.0, 1.0), (1.0, 1.0), 0.0)
     write_confidences(str(path), {"histogram": model}, {})
     assert read_confidences(str(path)) == ({"histogram": model}, {})
     os.mkfifo(tmp_path / "pipe.json")

@@ -20,12 +20,10 @@ from mfvpr.evaluation.dataset_ranking import matches_recipe
 from mfvpr.matchers import Scales
 from mfvpr.report import runs, searches
 from mfvpr.systems.assembly import without
-from mfvpr.tuning.learning.comparison import compare
-from mfvpr.tuning.learning.models import LOSSES, Options
+from mfvpr.tuning.learning.models import LOSSES, Options, compare
 from mfvpr.tuning.learning.splits import Part, join_data_sets
 from mfvpr.tuning.learning.training import Checkpoints
-from mfvpr.tuning.sweeps import Axes
-from mfvpr.tuning.sweeps.setting_search import can_learn
+from mfvpr.tuning.sweeps import Axes, can_learn
 from mfvpr.utils import Stopwatch, recipe_of
 from mfvpr.utils.errors import InputError
 from mfvpr.utils.fields import to_values
@@ -145,7 +143,7 @@ def _checkpoints(settings: Learn, axes: Axes, data: Part, sets: list[Prepared]) 
         "tolerances": to_values(settings.recall),
         **{name: getattr(settings, name) for name in (*_TRAINING, "loss", "inputs")},
         "retrieval_score": settings.fusion.retrieval_score,
-        "positives": data.protocol.fingerprint,
+        "positives": recipe_of([*data.protocol.positives]),
         "reported": dict(data.protocol.reported_sets),
         "versions": {**{name: versions()[name] for name in ("mfvpr", "jax", "numpy")}, "optax": version("optax")},
     }

@@ -24,9 +24,7 @@ from mfvpr.retrieval import Retrieval
 from mfvpr.storage import FeatureCache
 from mfvpr.systems import assembly
 from mfvpr.systems.assembly import choices_of
-from mfvpr.tuning.sweeps import Axes, DriveRanking, SweepOptions, search_grid, search_optuna
-from mfvpr.tuning.sweeps.setting_rankings import forget_rankings
-from mfvpr.tuning.sweeps.setting_search import require_optuna
+from mfvpr.tuning.sweeps import Axes, DriveRanking, SweepOptions, require_optuna, search_grid, search_optuna
 from mfvpr.utils import InputError, Runtime, Stopwatch
 from mfvpr.utils.fields import NOT_NEGATIVE, check_values, list_of, to_values
 from mfvpr.utils.fields import Setting as Declared
@@ -79,8 +77,7 @@ def sweep_program(settings: Settings) -> None:
             write=lambda new: searches.write_sweep(new, outcome, heading, about),
             figures=searches.sweep_figures(outcome),
         )
-        ranked = [axes.setting(plain) for plain in outcome.settings]
-        forget_rankings(axes.scorer, ranked, matches, candidates, outcome.protocol.views, options)
+        outcome.forget_rankings(matches, candidates, options)
 
 
 def axes_of(settings: Searched) -> Axes:

@@ -19,7 +19,7 @@ from mfvpr.evaluation.rankings import Ranked
 from mfvpr.utils.errors import InputError
 from mfvpr.utils.files import require_file, require_replaceable, write_text
 
-APART = 5  # rows of the database, by default
+APART = 5  # rows of the database
 REFUSALS = 0.2, 0.5  # shares of images without enough evidence, by default
 AROUND = 5  # times the distance of a correct prediction: nearer images show the place, or are not known to be elsewhere
 _LEAST_WEIGHT = 1e-9  # of an input: smaller ones are rounding errors, which would order equal predictions
@@ -29,7 +29,7 @@ _PRIOR = 2  # added candidates of other places, with the variance of all candida
 BINS = 10  # of probabilities from 0 to 1
 
 
-def confidence_inputs(ranked: Ranked, *, apart: int = APART) -> Float[np.ndarray, "queries 2"]:
+def confidence_inputs(ranked: Ranked) -> Float[np.ndarray, "queries 2"]:
     """Margin and height, the inputs of the confidence in the top predictions; NaN without a prediction.
 
     margin: log(1 + x), where x is the difference of the first score and that of the best candidate of another place,
@@ -37,11 +37,11 @@ def confidence_inputs(ranked: Ranked, *, apart: int = APART) -> Float[np.ndarray
         drawn towards the standard deviation of all candidates; if there are none, the input is infinite.
     height: the same, with the mean score of candidates of other places instead of the best.
 
-    Database images within `apart` rows of the prediction count as its place.
+    Database images within 5 rows of the prediction count as its place.
     """
     there = (ranked.rows >= 0) & np.isfinite(ranked.scores)
     scores = np.where(there, ranked.scores, 0.0).astype(np.float64)
-    elsewhere = there & (np.abs(ranked.rows - ranked.rows[:, :1]) > apart)
+    elsewhere = there & (np.abs(ranked.rows - ranked.rows[:, :1]) > APART)
 
     def moments(where: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Number, mean and variance of each query's scores; 0 if there are none."""
@@ -52,7 +52,7 @@ def confidence_inputs(ranked: Ranked, *, apart: int = APART) -> Float[np.ndarray
 
     (count, mean, variance), (_, _, prior) = moments(elsewhere), moments(there)
     spread = np.sqrt((count * variance + _PRIOR * prior) / (count + _PRIOR))
-    spread = np.maximum(np.maximum(spread, _LEAST_SPREAD * np.abs(scores[:, 0])), np.finfo(np.float64).tiny)
+    spread = np.maximum(spread, np.maximum(_LEAST_SPREAD * np.abs(scores[:, 0]), np.finfo(np.float64).tiny))
     second = np.max(scores, axis=1, where=elsewhere, initial=-np.inf)
     above = np.maximum(scores[:, :1] - np.stack([second, mean], axis=1), 0)
     inputs = np.where(elsewhere.any(axis=1, keepdims=True), np.log1p(above / spread[:, None]), np.inf)
@@ -63,7 +63,6 @@ def confidence_inputs(ranked: Ranked, *, apart: int = APART) -> Float[np.ndarray
 class Confidence:
     """A logistic model of the probability that a system's top prediction is correct."""
 
-    apart: int  # see `confidence_inputs`
     center: tuple[float, ...]  # mean of each input over the data that the model was fitted on
     scale: tuple[float, ...]  # standard deviation of each input over these data
     weights: tuple[float, ...]  # of the inputs in these units
@@ -73,7 +72,7 @@ class Confidence:
 
     def __call__(self, ranked: Ranked) -> Float[np.ndarray, " queries"]:
         """Probabilities, NaN without a prediction."""
-        return self.probability(confidence_inputs(ranked, apart=self.apart))
+        return self.probability(confidence_inputs(ranked))
 
     def probability(self, inputs: Float[np.ndarray, "queries inputs"]) -> Float[np.ndarray, " queries"]:
         """Probabilities from inputs; an infinite input counts as its center."""
@@ -81,27 +80,22 @@ class Confidence:
         return scipy.special.expit(centered @ np.array(self.weights) + self.bias)
 
 
-def fit_confidence(
-    values: Float[np.ndarray, "queries inputs"], correct: Bool[np.ndarray, " queries"], *, apart: int = APART
-) -> Confidence:
+def fit_confidence(values: Float[np.ndarray, "queries inputs"], correct: Bool[np.ndarray, " queries"]) -> Confidence:
     """Fit a logistic model with weights of at least 0 by penalized maximum likelihood; InputError without predictions.
 
-    If larger inputs go with incorrect predictions, the probability does not depend on them. If all predictions are
-    correct, it stays below 1: half a correct and half an incorrect prediction are added at the center.
-
-    Args:
-        values: of `confidence_inputs` with this `apart`; rows that are not finite are left out.
-        correct: whether the top prediction is correct; False for queries without a place in the database.
+    Rows of `values` (`confidence_inputs`) that are not finite are left out. For queries without a place in the database
+    no prediction is `correct`. Half a correct and half an incorrect prediction are added at the center, so that the
+    probability stays below 1.
     """
-    values, correct = np.asarray(values), np.asarray(correct, bool)
     there = np.isfinite(values).all(axis=1)
-    values, correct = values[there], correct[there]
+    values, correct = values[there], np.asarray(correct, bool)[there]
     if not len(values):
         raise InputError("confidence: expected predictions to fit it on, with candidates of other places, got none")
     center, scale = values.mean(axis=0), values.std(axis=0)
     scale = np.where(scale > 0, scale, 1.0)
     columns = np.column_stack([np.ones(len(values)), (values - center) / scale])
     penalty = np.array([0.0, *[1.0] * values.shape[1]])
+    bounds = [(None, None), *[(0.0, None)] * values.shape[1]]
 
     def loss(weights: np.ndarray) -> tuple[float, np.ndarray]:
         odds, bias = columns @ weights, weights[0]
@@ -110,12 +104,10 @@ def fit_confidence(
         gradient[0] += scipy.special.expit(bias) - 0.5
         return value + np.logaddexp(0, bias) - bias / 2, gradient
 
-    bounds = [(None, None), *[(0.0, None)] * values.shape[1]]
     options = {"ftol": 1e-13, "gtol": 1e-8, "maxiter": 1000}
-    start = np.zeros(len(bounds))
-    best = scipy.optimize.minimize(loss, start, jac=True, method="L-BFGS-B", bounds=bounds, options=options).x
-    bias, *weights = np.where(np.abs(best) > _LEAST_WEIGHT, best, 0.0).tolist()
-    return Confidence(apart, tuple(center.tolist()), tuple(scale.tolist()), tuple(weights), bias)
+    fit = scipy.optimize.minimize(loss, 0 * penalty, jac=True, method="L-BFGS-B", bounds=bounds, options=options)
+    bias, *weights = np.where(np.abs(fit.x) > _LEAST_WEIGHT, fit.x, 0.0).tolist()
+    return Confidence(tuple(center.tolist()), tuple(scale.tolist()), tuple(weights), bias)
 
 
 class CalibrationData(NamedTuple):
@@ -123,7 +115,7 @@ class CalibrationData(NamedTuple):
 
     present: Float[np.ndarray, "queries inputs"]  # of the queries as they are, see `confidence_inputs`
     absent: Float[np.ndarray, "queries inputs"]  # without the images of their place; NaN if no candidate is left
-    correct: Bool[np.ndarray, " queries"]  # whether the top predictions of the queries as they are are correct
+    correct: Bool[np.ndarray, " queries"]  # top predictions of the queries as they are
 
     @property
     def num_absent(self) -> int:
@@ -136,16 +128,14 @@ class CalibrationData(NamedTuple):
 
     def fit(self) -> Confidence:
         """Fit a confidence on present and absent places; an `InputError` if no query has usable inputs."""
-        never = np.zeros(len(self.absent), bool)
-        return fit_confidence(np.concatenate([self.present, self.absent]), np.concatenate([self.correct, never]))
+        correct = np.append(self.correct, np.zeros(len(self.absent), bool))
+        return fit_confidence(np.concatenate([self.present, self.absent]), correct)
 
 
 def calibration_data(ranked: Ranked, truth: Truth, threshold: float) -> CalibrationData:
     """Count each query as it is, and once more as an image of an absent place, see `absent_ranking`.
 
-        confidence = calibration_data(ranked, truth, 2).fit()
-
-    `threshold` is the largest distance of a correct prediction.
+    confidence = calibration_data(ranked, truth, 2).fit()  # correct within 2 frames
     """
     absent = confidence_inputs(absent_ranking(ranked, truth, threshold))
     correct = truth.positives(threshold).contains(ranked.rows)[:, 0]
@@ -161,15 +151,14 @@ def absent_ranking(ranked: Ranked, truth: Truth, threshold: float) -> Ranked:
     place = truth.shows_place(AROUND * max(threshold, 1))
     is_left_out = place.contains(ranked.rows) | (place.counts == 0)[:, None]
     order = np.argsort(is_left_out, axis=1, kind="stable")
-    rows, scores = np.where(is_left_out, -1, ranked.rows), np.where(is_left_out, np.nan, ranked.scores)
-    return Ranked(np.take_along_axis(rows, order, axis=1), np.take_along_axis(scores, order, axis=1))
+    values = np.where(is_left_out, -1, ranked.rows), np.where(is_left_out, np.nan, ranked.scores)
+    return Ranked(*(np.take_along_axis(each, order, axis=1) for each in values))
 
 
 def write_confidences(path: Path | str, systems: Mapping[str, Confidence], recipe: Mapping[str, Any]) -> None:
     """Write confidences by name as JSON, with the recipe of their rankings; an InputError for another file."""
     require_replaceable(Path(path), _FORMAT.encode())
-    values = {name: vars(confidence) for name, confidence in systems.items()}
-    content = {"format": _FORMAT, "made": recipe, "systems": values}
+    content = {"format": _FORMAT, "made": recipe, "systems": {name: vars(each) for name, each in systems.items()}}
     write_text(Path(path), json.dumps(content, indent=1, ensure_ascii=False, allow_nan=False) + "\n")
 
 
@@ -190,12 +179,12 @@ def read_confidences(path: Path | str) -> tuple[dict[str, Confidence], dict[str,
 def confidence_from_json(values: Mapping[str, Any]) -> Confidence:
     """The confidence whose `vars` were written as JSON; a TypeError or ValueError for values that make no model."""
     vectors = {name: tuple(values[name]) for name in ("center", "scale", "weights", "refusals")}
-    numbers = np.array([*vectors.values()], float)  # [4, 2]: two inputs, two shares
+    numbers = np.array([*vectors.values()], float).reshape(4, 2)  # two inputs, two shares
     _, scale, weights, shares = numbers
-    is_fitted = numbers.shape == (4, 2) and np.isfinite([*numbers.flat, values["bias"], values["apart"]]).all()
-    if not (is_fitted and min(*scale, *shares) > 0 and min(weights) >= 0 and max(shares) <= 1):
+    is_finite = np.isfinite([*numbers.flat, values["bias"]]).all()
+    if not (is_finite and min(*scale, *shares) > 0 and min(weights) >= 0 and max(shares) <= 1):
         raise ValueError("values that make no model")
-    return Confidence(**{**values, **vectors})
+    return Confidence(bias=values["bias"], **vectors)
 
 
 class PrecisionRecall(NamedTuple):
@@ -225,9 +214,8 @@ class Reliability(NamedTuple):
     @property
     def calibration_error(self) -> float:
         """Expected calibration error: mean of |probability - fraction of correct ones| over all predictions, or NaN."""
-        if not self.count.any():
-            return float("nan")
-        return float(np.nansum(self.count * np.abs(self.probability - self.correct)) / self.count.sum())
+        errors = self.count * np.abs(self.probability - self.correct)
+        return float(np.nansum(errors) / self.count.sum()) if self.count.any() else float("nan")
 
 
 def precision_recall(
@@ -235,13 +223,10 @@ def precision_recall(
     correct: Bool[np.ndarray, " queries"],
     has_positives: Bool[np.ndarray, " queries"] | None = None,
 ) -> PrecisionRecall:
-    """Precision and recall of top predictions at every threshold.
+    """Precision and recall of top predictions at every threshold of a confidence; NaN without a prediction.
 
-    Args:
-        confidence: any number that is larger for more confident predictions; NaN without a prediction.
-        correct: whether the top prediction is correct.
-        has_positives: queries with positives in the database; None = all. A prediction for another query is incorrect
-            and lowers the precision. An InputError if it is called correct.
+    Queries without positives in the database have no correct prediction, else an InputError; `has_positives` None = all
+    have some.
     """
     confidence, correct = np.asarray(confidence, float), np.asarray(correct, bool)
     if has_positives is not None and np.any(correct & ~np.asarray(has_positives, bool)):
@@ -256,10 +241,9 @@ def precision_recall(
 
 def reliability(probability: Float[np.ndarray, " queries"], correct: Bool[np.ndarray, " queries"]) -> Reliability:
     """Compare probabilities with the fractions of correct predictions, in 10 bins; NaN probabilities are left out."""
-    probability, correct = np.asarray(probability, float), np.asarray(correct, bool)
     there = ~np.isnan(probability)
     probability, correct = probability[there], correct[there]
-    place = _bin_numbers(probability)
+    place = np.minimum((probability * BINS).astype(int), BINS - 1)
     count = np.bincount(place, minlength=BINS)
     divisor = np.where(count > 0, count, np.nan)
     mean, share = (np.bincount(place, weights=values, minlength=BINS) / divisor for values in (probability, correct))
@@ -271,14 +255,10 @@ def chance_calibration_error(probability: Float[np.ndarray, " queries"]) -> floa
     probability = probability[~np.isnan(probability)]
     if not len(probability):
         return float("nan")
-    place, distance = _bin_numbers(probability), 0.0
+    place, distance = np.minimum((probability * BINS).astype(int), BINS - 1), 0.0
     for number in range(BINS):
         inside, chances = probability[place == number], np.ones(1)  # of 0 ... correct predictions in the bin
         for value in inside:
             chances = np.convolve(chances, (1 - value, value))
         distance += chances @ np.abs(np.arange(len(chances)) - inside.sum())
     return float(distance / len(probability))
-
-
-def _bin_numbers(probability: np.ndarray) -> np.ndarray:
-    return np.clip((probability * BINS).astype(int), 0, BINS - 1)

@@ -1,13 +1,9 @@
 """All stages in one call: images -> features -> shortlist -> matches -> scores -> ranking -> recall.
 
-    sift = Sift()
-    pipeline = Pipeline(sift, Retrieval(Aggregated(sift, VladFitting())), candidates=50)
-    ranked = rank_dataset(dataset, System(pipeline, {"histogram": mfvpr.HistogramOfShifts()}))
+    ranked = rank_dataset(dataset, mfvpr.System(pipeline, {"histogram": mfvpr.HistogramOfShifts()}))
     print(ranked.recall([0.0])["histogram"].pooled)
 
 `mfvpr.evaluate` does this for several data sets and systems, and reports.
-
-Features, shortlist and matches are kept in the folder of a cache, if it has one.
 """
 
 import json
@@ -38,27 +34,16 @@ from mfvpr.utils.runtime import Runtime, Stopwatch
 
 KS = (1, 5, 10)  # depths of recall, by default
 _REMARKS = "images.json"  # beside the matches: which images are bad
-Reason = Literal[  # why there is no place
-    "no candidates",
-    "overexposed",
-    "blurred",
-    "too few features",
-    "too few matches",
-    "no better than noise",
-    "low confidence",
-    "off the map",
-]
+_OfEvidence = Literal["overexposed", "blurred", "too few features", "too few matches", "no better than noise"]
+Reason = Literal[_OfEvidence, "no candidates", "low confidence", "off the map"]  # why there is no place
 
 
-@dataclass(frozen=True, repr=False)
+@dataclass(frozen=True)
 class Recall:
     """Recall of one system, from numbers of correct queries and of all queries."""
 
     correct: Int[np.ndarray, "sequences tolerances ks"]
     queries: Int[np.ndarray, " sequences"]
-
-    def __repr__(self) -> str:
-        return f"Recall({np.round(self.pooled, 3).tolist()} over all queries, by threshold and k)"
 
     @property
     def by_sequence(self) -> Float[np.ndarray, "sequences tolerances ks"]:
@@ -86,22 +71,20 @@ class RankedDataset:
     systems: Mapping[str, Sequence[Ranked]]  # rankings of each sequence, by name of the final score
     seconds: Mapping[str, float]  # by stage
 
-    def __repr__(self) -> str:
-        return f"RankedDataset({self.dataset!r} by {', '.join(self.systems)})"
-
     def positives(self, threshold: float) -> list[Positives]:
         """Positives at a threshold, by sequence; an InputError without a ground truth of all images."""
         if not threshold >= 0:
             raise InputError(f"threshold={threshold}: expected a number from 0")
-        truths = [sequence.truth for sequence in self.dataset.sequences]
-        if any(truth is None for truth in truths):
-            raise InputError(f"{self.dataset.name}: there is no ground truth, so rankings only")
-        positives = [truth.positives(threshold) for truth in truths if truth is not None]
-        for sequence, truth in zip(self.dataset.sequences, positives, strict=True):
+        positives = []
+        for sequence in self.dataset.sequences:
+            if sequence.truth is None:
+                raise InputError(f"{self.dataset.name}: there is no ground truth, so rankings only")
+            truth = sequence.truth.positives(threshold)
             expected, got = (len(sequence.images), len(self.dataset.database)), (len(truth), truth.num_database)
             if got != expected:
                 words = "{} queries and {} database images".format
                 raise InputError(f"{sequence.name}: expected a ground truth of {words(*expected)}, got {words(*got)}")
+            positives.append(truth)
         return positives
 
     def recall(self, thresholds: Sequence[float], ks: Sequence[int] = KS) -> dict[str, Recall]:
@@ -112,7 +95,6 @@ class RankedDataset:
         if min(ks, default=1) < 1:
             raise InputError(f"ks={[*ks]}: expected depths from 1")
         by_threshold = [self.positives(threshold) for threshold in thresholds]
-
         recalls = {}
         for name, rankings in self.systems.items():
             correct = [
@@ -129,44 +111,31 @@ def rank_dataset(
 ) -> RankedDataset:
     """Rank every query's candidates by the retrieval, by every scorer, and by combined scores.
 
-    Args:
-        cache: where features and matches are kept; None = in memory. With a folder, compiled programs stay on disk as
-            well, see `mfvpr.utils.compiled_programs`.
-        runtime: devices, memory, progress and messages; None = those of the cache.
-
-    Raises:
-        InputError: images, stores or features that cannot be used, or an invalid result of an extractor, the retrieval
-            or a scorer; one line says which, and how to fix it.
+    The `cache` (None = in memory) keeps features, matches and compiled programs; its runtime is the default. An
+    InputError says in one line which image, store, or result of an extractor, the retrieval or a scorer is unusable.
     """
     watch, cache = Stopwatch(), cache or FeatureCache()
     cache = replace(cache, runtime=runtime or cache.runtime, watch=watch)
     if cache.root is not None:
         keep_compiled_programs()
     system = system.fit_image_size(folders_of(dataset), cache.warn)
-    systems = dict[str, list[Ranked]]()
+    systems: dict[str, list[Ranked]] = {}
     matched = [match_sequence(dataset, each, system.pipeline, cache=cache) for each in dataset.sequences]
     for sequence in matched:
         with watch("scores"):
             scores = stages.score(system.scorers, sequence.by_scale, sequence.candidates, runtime=cache.runtime)
-        excluded = sequence.sequence.excluded if system.sequences else None
+        finals, excluded = system.final_scores.values(), sequence.sequence.excluded
         rankings = rank_by_scores(
-            sequence.candidates,
-            scores,
-            system.final_scores.values(),
-            system.ties,
-            num_rows=len(dataset.database),
-            excluded=None if excluded is None else excluded.dense(),
+            sequence.candidates, scores, finals, system.ties, num_rows=len(dataset.database), excluded=excluded
         )
         for name, ranking in rankings.items():
             systems.setdefault(name, []).append(ranking)
-    for name in system.scorers:
-        stages.require_finite(name, np.concatenate([ranked.scores[ranked.rows >= 0] for ranked in systems[name]]))
-    for number, sequence in enumerate(dataset.sequences):
-        for name, rankings in systems.items():
-            values = rankings[number].scores[rankings[number].rows >= 0]
+            values = ranking.scores[ranking.rows >= 0]
             for words, is_bad in (("NaN, and rank last", np.isnan(values)), ("infinite", np.isinf(values))):
                 if count := int(is_bad.sum()):
-                    cache.warn(f"{sequence.name}: {count} scores of {name} are {words}")
+                    cache.warn(f"{sequence.sequence.name}: {count} scores of {name} are {words}")
+    for name in system.scorers:
+        stages.require_finite(name, np.concatenate([ranked.scores[ranked.rows >= 0] for ranked in systems[name]]))
     return RankedDataset(dataset, system, matched, systems, watch.seconds)
 
 
@@ -180,8 +149,8 @@ def match_sequence(
 ) -> Matched:
     """Find and match the candidates of one sequence's queries; features of other database images are not extracted.
 
-    If the cache has a root, matches are kept below it. If they are all there, nothing else is read. The watch of the
-    cache gets the seconds of the stages; arguments and errors are those of `mfvpr.evaluate`.
+    If a cache with a root has all matches, nothing else is read. Its watch gets the seconds of the stages; arguments
+    and errors are those of `mfvpr.evaluate`.
     """
     cache, database = cache or FeatureCache(), dataset.database
     watch = cache.watch or Stopwatch()
@@ -194,8 +163,8 @@ def match_sequence(
     with watch("retrieval"):
         retriever = fit_to_database(pipeline.retriever, database, cache)
         pipeline = replace(pipeline, retriever=retriever)
-    number, stores = num_candidates(pipeline.candidates, database), list[MatchStore]()
-    recipe = cache.recipe(lambda: matches_recipe(dataset, sequence, pipeline, cache))
+    number = num_candidates(pipeline.candidates, database)
+    recipe, stores = cache.recipe(lambda: matches_recipe(dataset, sequence, pipeline, cache)), list[MatchStore]()
     if recipe is not None and cache.root is not None:
         scales = range(len(pipeline.scales))
         stores = [MatchStore(cache.root, recipe | {"scale": scale}, len(sequence.images)) for scale in scales]
@@ -240,8 +209,7 @@ def matches_recipe(
     dataset: Dataset, sequence: QuerySequence, pipeline: Pipeline, cache: FeatureCache
 ) -> dict[str, Any]:
     """JSON values that determine a shortlist and its matches: images and features, retrieval, and matcher."""
-    excluded, database = sequence.excluded, dataset.database
-    extractor = None
+    database, extractor = dataset.database, None
     if pipeline.image_source is None:
         extractor = fit_to_database(pipeline.extractor, database, cache)
     return {
@@ -251,7 +219,7 @@ def matches_recipe(
         "candidates": num_candidates(pipeline.candidates, database),
         "matching": cache.recipes.of(pipeline.matcher),
         "skip_bad": cache.skip_bad,
-        "excluded": recipe_of(excluded),
+        "excluded": recipe_of(sequence.excluded),
     }
 
 
@@ -263,8 +231,7 @@ def _read_matches(
         return None
     try:
         remarks = json.loads((stores[0].folder / _REMARKS).read_text())
-        remarks = {name: remarks[name] for name in ("warnings", "queries", "database")}
-    except (OSError, ValueError, LookupError, TypeError):
+    except (OSError, ValueError):
         return None  # so images are read again, but not matched
     cache.runtime.log(f"{sequence.name} matches: all {len(sequence.images)} queries from {stores[0].folder}")
     with watch("matches read"):
@@ -280,10 +247,9 @@ def _extract(
     dataset: Dataset, sequence: QuerySequence, pipeline: Pipeline, retrieved: RetrievalResult, cache: FeatureCache
 ) -> tuple[list[tuple[Side, Side]], dict[str, Any]]:
     """Features of the queries and of all candidates by scale, or their images, and remarks on bad images."""
-    extractor, candidates = pipeline.extractor, retrieved.candidates
+    extractor, candidates, sides = pipeline.extractor, retrieved.candidates, (sequence.images, dataset.database)
     remarks: dict[str, Any] = {"queries": retrieved.bad_queries, "database": retrieved.bad_database}
     if (source := pipeline.image_source) is not None:
-        sides = sequence.images, dataset.database
         return [sides], remarks | {"warnings": source.open(*sides).warnings(candidates)}
     rows = np.unique(candidates.indices[candidates.mask]).tolist()
     database = cache.local(dataset.database, extractor, rows, label="database")

@@ -8,10 +8,8 @@ an end of the map. The likelihood of an image at a row, relative to an image tha
 
 where `correct` is the probability of a correct top prediction on the map, `share` the row's part of the candidates'
 scores, relative to equal parts, and `odds` says how much more likely the scores are if the top prediction is correct.
-Each candidate also speaks for the rows next to it.
-
-Whether the robot is on the map at all is a second model of two states: an image is as likely as the first model says,
-or shows nothing of the map.
+Each candidate also speaks for the rows next to it. Whether the robot is on the map at all is a second model of two
+states: an image is as likely as the first model says, or shows nothing of the map.
 """
 
 import itertools
@@ -43,37 +41,30 @@ _REACH = 4  # standard deviations of the motion
 _EXACT = jax.lax.Precision.HIGHEST
 
 # Confidence that a top prediction is correct, if half of the queries show a place that is not in the database: fitted
-# on all scores of `scorer=demo`, SIFT, on seven drives through the synthetic street (`dataset=streets_seasons`), by
-# `python -m experiments.sequences --fit` at commit 7f66579.
-STREETS = Confidence(5, (1.288, 1.852), (0.998, 0.662), (0.740, 3.306), 0.474)
+# on the drives of `dataset=streets_seasons`, `scorer=demo`, by `python -m experiments.sequences --fit`.
+STREETS = Confidence((1.288, 1.852), (0.998, 0.662), (0.740, 3.306), 0.474)
 
 
 @dataclass(frozen=True)
 class Drive:
-    """Motion of a robot along the rows of a map.
+    """Motion of a robot along the rows of a map; probabilities are for each image.
 
         drive = mfvpr.Drive(advance=1.0, spread=0.5)  # as fast as the drive of the map
 
-    Attributes:
-        advance: mean motion from one image to the next, rows; below 0 = against the order of the map. None = learned
-            from the images, between -8 and 8, and it may change on the way.
-        spread: standard deviation of the motion, rows.
-        kidnapped: probability, for each image, that the robot may be anywhere on the map.
-        leaves: probability, for each image, that the robot leaves the map.
-        returns: probability, for each image, that a robot that left the map is on it again.
-        correct: probability that the top prediction is correct while the robot is on the map.
+    `advance` is the mean motion from one image to the next, rows; below 0 = against the order of the map. None =
+    learned from the images, between -8 and 8, and it may change on the way.
     """
 
     advance: float | None = None
-    spread: float = 0.7
-    kidnapped: float = 0.03
-    leaves: float = 0.02
-    returns: float = 0.1
-    correct: float = 0.75
+    spread: float = 0.7  # standard deviation of the motion, rows
+    kidnapped: float = 0.03  # probability that the robot may be anywhere on the map
+    leaves: float = 0.02  # probability that the robot leaves the map
+    returns: float = 0.1  # probability that a robot that left the map is on it again
+    correct: float = 0.75  # probability that the top prediction is correct while the robot is on the map
 
     def __post_init__(self) -> None:
-        if wrong := [each for each in vars(self).values() if not isinstance(each, int | float | None)]:
-            raise InputError(f"{self}: expected numbers, got {wrong[0]!r}")
+        if not all(isinstance(each, int | float | None) for each in vars(self).values()):
+            raise InputError(f"{self}: expected numbers")
         if not (abs(self.advance or 0) <= 10_000 and 1e-4 <= self.spread <= 100):
             raise InputError(f"{self}: expected at most 10000 rows, and a spread from 0.0001 to 100")
         if not all(0 <= p <= 1 for p in (self.kidnapped, self.leaves, self.correct)) or not 0 < self.returns <= 1:
@@ -98,15 +89,13 @@ class Evidence(NamedTuple):
     @classmethod
     def of(cls, ranked: Ranked, confidence: Float[np.ndarray, " images"] | None = None) -> "Evidence":
         """Evidence of a ranking's images; `confidence` is that of `STREETS` by default."""
-        p = STREETS(ranked) if confidence is None else confidence
-        p = np.nan_to_num(p, nan=0.0)
+        p = np.nan_to_num(STREETS(ranked) if confidence is None else confidence, nan=0.0)
         odds = np.clip(p / np.maximum(1 - p, 1e-9), 1 / _MOST_ODDS, _MOST_ODDS)
         # Shares: the square of the score above the mean; 0 if it is not finite.
         finite = (ranked.rows >= 0) & np.isfinite(ranked.scores)
         values = np.where(finite, ranked.scores, 0.0).astype(np.float64)
         mean = values.sum(axis=1, keepdims=True) / np.maximum(finite.sum(axis=1), 1)[:, None]
-        above = np.maximum(np.where(finite, values - mean, 0), 0)
-        powers = (above / np.maximum(above.max(axis=1, keepdims=True), np.finfo(np.float64).tiny)) ** _SHARPNESS
+        powers = np.maximum(np.where(finite, values - mean, 0), 0) ** _SHARPNESS
         powers = np.where(powers.any(axis=1, keepdims=True), powers, finite)  # all scores are equal
         shares = (powers / np.maximum(powers.sum(axis=1, keepdims=True), 1e-300)).astype(np.float32)
         return cls(ranked.rows.astype(np.int32), shares, odds.astype(np.float32))
@@ -165,10 +154,7 @@ class DriveModel:
         return self.normalize((inside + carried * self.anywhere) * here[None])
 
     def before(self, later: Float[Array, "speeds rows"], here: Float[Array, " rows"]) -> Float[Array, "speeds rows"]:
-        """Relative probabilities of an image and those after it, by the state at the image before.
-
-        It is the transpose of the motion in `after`.
-        """
+        """Relative probabilities of an image and those after it, by the state before: the transpose of `after`."""
         later = later * here[None]
         anywhere = (later * self.anywhere).sum()
         wide = jnp.where(self._is_inside, jnp.pad(later, ((0, 0), (self.reach, self.reach))), anywhere)
@@ -204,11 +190,8 @@ class DriveModel:
         number = steps.shape[1]
         cut = lambda row, start: jax.lax.dynamic_slice(row, (start,), (size + number - 1,))  # noqa: E731
         aligned = jax.vmap(cut)(values, starts)
-
-        def add_step(k: int, total: Array) -> Array:
-            return total + steps[:, k, None] * jax.lax.dynamic_slice_in_dim(aligned, k, size, axis=1)
-
-        return jax.lax.fori_loop(0, number, add_step, jnp.zeros((len(values), size)))
+        step = lambda k: steps[:, k, None] * jax.lax.dynamic_slice_in_dim(aligned, k, size, axis=1)  # noqa: E731
+        return jax.lax.fori_loop(0, number, lambda k, total: total + step(k), jnp.zeros((len(values), size)))
 
 
 def _gaussian(mean: float, spread: float) -> Float[np.ndarray, " steps"]:
@@ -247,14 +230,10 @@ class Followed(NamedTuple):
 class DriveFilter:
     """Rankings of the queries of a drive by a model of its motion, see `mfvpr.evaluation.drives`.
 
-        systems = {"mine": mfvpr.System(pipeline, scorers, sequences={"histogram": (DriveFilter("smoothed"),)})}
-
-    Attributes:
-        method: "causal" uses the queries before, "lagged" also the next 5, "smoothed" all.
-        drive: motion of the robot.
+    systems = {"mine": mfvpr.System(pipeline, scorers, sequences={"histogram": (DriveFilter("smoothed"),)})}
     """
 
-    method: Method = "causal"
+    method: Method = "causal"  # uses the queries before; "lagged": also the next 5; "smoothed": all
     drive: Drive = DEFAULT_DRIVE
 
     def __post_init__(self) -> None:
@@ -303,8 +282,7 @@ def follow(
         length = math.isqrt(images - 1) + 1
         padded = _pad(evidence, -images % length)
         parts = jax.tree.map(lambda values: values.reshape(-1, length, *values.shape[1:]), padded)
-        is_image = (np.arange(padded.odds.size) < images).reshape(-1, length)
-        smoothed = _smoothed(parts, is_image, model, depth=depth)
+        smoothed = _smoothed(parts, model, depth=depth)
         rows, p = (values.reshape(-1, depth)[:images] for values in smoothed)
     return Followed(np.asarray(rows), np.asarray(p), off)
 
@@ -333,33 +311,29 @@ def _lagged(evidence: Evidence, drive: DriveModel, *, lag: int, depth: int) -> t
 
 
 @partial(compiled, static_argnames="depth")
-def _smoothed(
-    parts: Evidence, is_image: Bool[Array, "parts images"], drive: DriveModel, *, depth: int
-) -> tuple[Array, Array]:
+def _smoothed(parts: Evidence, drive: DriveModel, *, depth: int) -> tuple[Array, Array]:
     """The best rows of each image, from all images, and their probabilities.
 
     Beliefs are kept at the start of each part, and computed again.
     """
 
-    def forward(belief: Array, image: Evidence) -> tuple[Array, tuple[Array, Array]]:
+    def forward(belief: Array, image: Evidence) -> tuple[Array, tuple[Array, Array, Array]]:
         here = drive.likelihood(image)
         belief, _ = drive.after(belief, here)
-        return belief, (belief, here)
+        return belief, (belief, here, image.odds > 0)  # padding has no odds
 
     def forward_part(belief: Array, part: Evidence) -> tuple[Array, Array]:
-        return jax.lax.scan(lambda belief, image: (forward(belief, image)[0], None), belief, part)[0], belief
+        return jax.lax.scan(forward, belief, part)[0], belief
 
     def backward(later: Array, image: tuple[Array, Array, Array]) -> tuple[Array, tuple[Array, Array]]:
         belief, here, is_image = image
         return jnp.where(is_image, drive.before(later, here), later), _best_rows(belief, later, drive, depth)
 
-    def backward_part(later: Array, part: tuple[Array, Evidence, Array]) -> tuple[Array, tuple[Array, Array]]:
-        start, images, is_image = part
-        _, beliefs_and_likelihoods = jax.lax.scan(forward, start, images)
-        return jax.lax.scan(backward, later, (*beliefs_and_likelihoods, is_image), reverse=True)
+    def backward_part(later: Array, part: tuple[Array, Evidence]) -> tuple[Array, tuple[Array, Array]]:
+        return jax.lax.scan(backward, later, jax.lax.scan(forward, *part)[1], reverse=True)
 
     _, starts = jax.lax.scan(forward_part, drive.anywhere, parts)
-    return jax.lax.scan(backward_part, jnp.ones_like(drive.anywhere), (starts, parts, is_image), reverse=True)[1]
+    return jax.lax.scan(backward_part, jnp.ones_like(drive.anywhere), (starts, parts), reverse=True)[1]
 
 
 def _best_rows(belief: Array, later: Array, drive: DriveModel, depth: int) -> tuple[Array, Array]:

@@ -1,12 +1,9 @@
 """The least evidence for a prediction: enough keypoints, enough matches, and a better score than noise has.
 
 A confidence compares the scores of one query with each other, so a black image can look certain. The tests here are
-absolute. An image is noise if its brightness at points near to each other has nothing in common, blurred if it is
-nearly the same there, and overexposed if most of the image is white. The strength of an image is the sum of its
-detection scores, compared with the mean of database images. The score of a query with its best candidate, a histogram
-of shifts weighted by ratio, is compared with the best scores of a few images of random pixels in the same database.
-
-The tests do not refuse images of places that the database does not show.
+absolute: brightness of an image at neighboring points, its detection scores, and the score of its best candidate by a
+histogram of shifts weighted by ratio, compared with images of random pixels. They do not refuse images of places that
+the database does not show.
 """
 
 import tempfile
@@ -53,17 +50,14 @@ def reason_against_image(pixels: UInt8[np.ndarray, "height width 3"]) -> Reason 
     brightness = brightness.astype(np.float32)
     rows, columns = (max(1, round(side / 80)) for side in brightness.shape)
     pairs = (brightness[rows:], brightness[:-rows]), (brightness[:, columns:], brightness[:, :-columns])
-
-    def correlation(first: np.ndarray, second: np.ndarray) -> float:
-        """Correlation of two images of one size; NaN if one of them is plain."""
+    correlations = []
+    for first, second in pairs:
         first, second = ((values - values.mean()).ravel() for values in (first, second))
         variances = np.vdot(first, first) * np.vdot(second, second)
-        return float(np.vdot(first, second) / np.sqrt(variances)) if variances else np.nan
-
-    correlations = np.array([correlation(*pair) for pair in pairs])
-    if (correlations < _LEAST_CORRELATION).all():
+        correlations.append(np.vdot(first, second) / np.sqrt(variances) if variances else np.nan)  # NaN: it is plain
+    if np.less(correlations, _LEAST_CORRELATION).all():
         return "no better than noise"
-    return "blurred" if (correlations > _MOST_CORRELATION).all() else None
+    return "blurred" if np.greater(correlations, _MOST_CORRELATION).all() else None
 
 
 def evidence_scores(pairs: Matches) -> Float[np.ndarray, " pairs"]:
@@ -82,10 +76,9 @@ def reason_against(matches: float, score: float, noise: float) -> Reason | None:
 
 
 def evidence_against(ranked: RankedDataset, cache: FeatureCache) -> list[list[Reason | None]]:
-    """Why there is too little evidence for the predictions of each query, by sequence; None = there is enough.
+    """Why there is too little evidence for each query's prediction by the ranking that decides, by sequence, or None.
 
-    The ranking that decides gives the predictions. Scores are known for matches with a ratio, of a single scale, and a
-    retrieval by global descriptors.
+    Scores are known for matches with a ratio, of a single scale, and a retrieval by global descriptors.
     """
     database, pipeline = ranked.dataset.database, ranked.system.pipeline
     sample, extractor = range(0, len(database), -(-len(database) // _SAMPLE)), pipeline.extractor

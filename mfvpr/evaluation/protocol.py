@@ -14,17 +14,18 @@ from mfvpr.core.types import Shortlist
 from mfvpr.datasets.ground_truth import Truth, Unit, threshold_words
 from mfvpr.datasets.positives import Positives, stack_positives
 from mfvpr.utils.errors import InputError
-from mfvpr.utils.fingerprints import fingerprint, recipe_of
 
 Split = Literal["first_half", "second_half", "both"]
 _HALVES = ("first_half", "second_half")
+Queries = Int[np.ndarray, " _"]  # numbers of queries
+Rows = Int[np.ndarray, "views settings queries depth"]  # rankings of the database by settings, within views
 
 
 class Half(NamedTuple):
     """Two disjoint parts of a path: settings are chosen or learned on one, and reported on the other."""
 
-    tune: Int[np.ndarray, " tune"]  # query rows to choose on
-    report: Int[np.ndarray, " report"]  # query rows to report on
+    tune: Queries  # to choose on
+    report: Queries  # to report on
     allowed: Bool[np.ndarray, " database"]  # database rows that may be used while choosing
     paths: tuple[int, ...] = ()  # number of queries to choose on of each path, if there are several
 
@@ -57,7 +58,7 @@ def halves_of_map(parts: Sequence[Positives], unit: Unit) -> tuple[Half, Half]:
     return separate(together, first, second), separate(together, second, first)
 
 
-def separate(positives: Positives, tune: Int[np.ndarray, " tune"], report: Int[np.ndarray, " report"]) -> Half:
+def separate(positives: Positives, tune: Queries, report: Queries) -> Half:
     """A half, in which choosing sees nothing of the reported places.
 
     Database rows that show the place of a reported query are not allowed, and queries whose place such a row shows are
@@ -88,13 +89,11 @@ def best_setting(recall: Float[np.ndarray, " settings"], axes: Mapping[str, Sequ
 
 
 def places_along_path(shown: Positives, unit: Unit) -> Int[np.ndarray, " queries"]:
-    """Places of the queries of one or several drives: whole numbers from 0 in the order of the map, -1 = none.
+    """Places of queries, from the images that show them: whole numbers from 0 in the order of the map, -1 = none.
 
     Frames of the map are in the order of their rows. Images with positions may have any order: two images are neighbors
     if they show the place of the same query, and each connected part of the map is traversed from one of its ends. With
     the unit "exact", images are in the order of the first queries that they show.
-
-    `shown` are images of the map that show each query's place, within a tolerance or a radius.
     """
     order = _traversal_order(shown) if unit == "m" else np.arange(shown.num_database)
     if unit == "exact":  # the first query whose place each image shows
@@ -107,16 +106,14 @@ def places_along_path(shown: Positives, unit: Unit) -> Int[np.ndarray, " queries
 
 def _traversal_order(shown: Positives) -> np.ndarray:
     """Position `[N]` of each image in a traversal of its connected part of the map from an end."""
-    queries, size = len(shown), len(shown) + shown.num_database
-    pairs = np.repeat(np.arange(queries), shown.counts), queries + shown.rows
-    graph = scipy.sparse.coo_array(
-        (np.ones(2 * len(pairs[0])), (np.append(*pairs), np.append(*pairs[::-1]))), shape=(size, size)
-    )
-    graph = graph.tocsr()
+    queries, images = len(shown), len(shown) + shown.rows
+    shape = queries, shown.num_database
+    shows = scipy.sparse.csr_array((np.ones(len(images)), shown.rows, shown.offsets), shape=shape)
+    graph = scipy.sparse.block_array([[None, shows], [shows.T, None]], format="csr")
     _, part = scipy.sparse.csgraph.connected_components(graph, directed=False)
-    rank, visited = np.zeros(size, int), 0
-    for start in np.unique(part[pairs[1]], return_index=True)[1]:
-        end = scipy.sparse.csgraph.breadth_first_order(graph, pairs[1][start], return_predecessors=False)[-1]
+    rank, visited = np.zeros(sum(shape), int), 0
+    for start in np.unique(part[images], return_index=True)[1]:
+        end = scipy.sparse.csgraph.breadth_first_order(graph, images[start], return_predecessors=False)[-1]
         order = scipy.sparse.csgraph.breadth_first_order(graph, end, return_predecessors=False)
         rank[order] = np.arange(visited, visited + len(order))
         visited += len(order)
@@ -146,11 +143,6 @@ class EvaluationProtocol:
         """Names of the halves."""
         return list(_HALVES) if self.split == "both" else [self.split] if self.split else []
 
-    @property
-    def fingerprint(self) -> str:
-        """Hash of the positives at each threshold."""
-        return fingerprint(recipe_of(list(self.positives)))
-
     def of(self, candidates: Shortlist) -> "EvaluationProtocol":
         """The protocol with the views of a shortlist."""
         allowed = [half.allowed[np.maximum(candidates.indices, 0)] for half in self.halves]
@@ -160,30 +152,22 @@ class EvaluationProtocol:
         """R@K with its threshold, for tables."""
         return f"R@{k}{threshold_words(self.unit, threshold)}"
 
-    def hits(
-        self, rows: Int[np.ndarray, "*batch queries depth"], queries: Int[np.ndarray, " queries"], k: int = 1
-    ) -> Bool[np.ndarray, "tolerances *batch queries"]:
-        """Whether the first k rows of the rankings of some queries have a positive, by threshold."""
+    def hits(self, rows: np.ndarray, queries: Queries, k: int = 1) -> Bool[np.ndarray, "tolerances *batch queries"]:
+        """Whether the first k rows of rankings `[..., queries, depth]` have a positive, by threshold."""
         return np.stack([hits(rows, positives.take(queries), k) for positives in self.positives])
 
-    def recall(
-        self, rows: Int[np.ndarray, "settings queries depth"], k: int = 1
-    ) -> Float[np.ndarray, "settings tolerances"]:
-        """Recall@k over all queries."""
+    def recall(self, rows: np.ndarray, k: int = 1) -> Float[np.ndarray, "settings tolerances"]:
+        """Recall@k over all queries of rankings `[settings, queries, depth]`."""
         return self.hits(rows, np.arange(rows.shape[1]), k).mean(axis=-1).T
 
-    def tuning(
-        self, rows: Int[np.ndarray, "views settings queries depth"]
-    ) -> Float[np.ndarray, "halves settings tolerances"]:
+    def tuning(self, rows: Rows) -> Float[np.ndarray, "halves settings tolerances"]:
         """Recall@1 over the queries to choose on."""
         if not self.halves:
             return self.recall(rows[0])[None]
         views = zip(rows[1:], self.halves, strict=True)
         return np.stack([self.hits(view[:, half.tune], half.tune).mean(axis=-1).T for view, half in views])
 
-    def reported_hits(
-        self, rows: Int[np.ndarray, "views settings queries depth"], chosen: Sequence[int]
-    ) -> Bool[np.ndarray, "tolerances reported"]:
+    def reported_hits(self, rows: Rows, chosen: Sequence[int]) -> Bool[np.ndarray, "tolerances reported"]:
         """Hits of the queries to report on, each with the setting that was chosen without it."""
         if not self.halves:
             return self.hits(rows[0][chosen[0]], np.arange(rows.shape[2]))[:, self.order]
@@ -210,13 +194,9 @@ class EvaluationProtocol:
 def evaluation_protocol(truth: Truth, thresholds: Iterable[float], split: Split | None = None) -> EvaluationProtocol:
     """Prepare an `EvaluationProtocol` before anything is ranked, so that errors of the ground truth are raised early.
 
-    Args:
-        truth: of the queries, in the order of their path.
-        thresholds: at least one, in any order. Queries to choose on and to report on share no place within the widest.
-        split: the half of the path to choose on, or both in turn; None = choose and report on all queries.
-
-    Raises:
-        InputError: no threshold, or a half without queries to choose on.
+    The `split` is the half of the path to choose on, or both in turn; None = choose and report on all queries. Queries
+    to choose on and to report on share no place within the widest threshold. An InputError without thresholds, or for a
+    half without queries to choose on.
     """
     thresholds = sorted(set(thresholds))
     if not thresholds:

@@ -1,7 +1,7 @@
 """Rankings of candidates by the scores of a system: of retrieval, of each scorer, and combined ones."""
 
 from collections import deque
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Literal
 
@@ -13,6 +13,7 @@ from jaxtyping import Bool, Float, Int, Num
 from mfvpr.core.ranking import at_least_32_bits, combine, rank
 from mfvpr.core.types import Array, Shortlist
 from mfvpr.datasets.datasets import QuerySequence
+from mfvpr.datasets.positives import Positives
 from mfvpr.matchers.match_set import MatchSet, Scales
 from mfvpr.utils.errors import InputError, require_word
 from mfvpr.utils.fields import NOT_NEGATIVE, POSITIVE
@@ -25,6 +26,7 @@ Ties = Literal["retrieval", "index"]
 RetrievalScore = Literal["cosine", "negative_euclidean"]
 Scores = Float[np.ndarray, "queries candidates"]
 AnyScores = Num[Array, "queries candidates"]
+OfQuery = Num[Array, " candidates"]
 
 RETRIEVAL = "retrieval"  # name of the retrieval's own ranking
 SEQUENCE = "sequence"  # in names of rankings by the motion along a drive
@@ -41,9 +43,6 @@ class Matched:
     bad_queries: Mapping[int, str]  # row -> reason, of images that could not be used
     bad_database: Mapping[int, str]
     weights: tuple[float, ...] | None = None  # of the scales; None = 1 each
-
-    def __repr__(self) -> str:
-        return f"Matched({self.sequence!r}, {self.candidates.indices.shape[1]} candidates each)"
 
     @property
     def by_scale(self) -> MatchSet | Scales:
@@ -64,9 +63,6 @@ class Ranked:
         order, rows = rank_shortlist(candidates, scores, ties=ties), np.where(candidates.mask, candidates.indices, -1)
         return cls(*(np.take_along_axis(values, order, axis=1) for values in (rows, scores)))
 
-    def __repr__(self) -> str:
-        return "Ranked({} queries, {} candidates each)".format(*self.rows.shape)
-
     @property
     def shortlist(self) -> Shortlist:
         """The ranking as a shortlist, to be written (`mfvpr.io.write_shortlist`) or matched again."""
@@ -80,9 +76,8 @@ class Fusion:
 
     Attributes:
         c: the combined score is main score + c * retrieval score; None = `balancing_c` of each query. "zscore" = the
-            sum of all scores, each with mean 0 and standard deviation 1 over the query's candidates (0 if all are
-            equal). With retrieval and main score only, "zscore" ranks finite scores as None does, but its values have
-            the same unit for every query. A score that is not finite affects only its own candidate.
+            sum of all scores, each standardized as in `fuse_scales`: it ranks two finite scores as None does, in a unit
+            that is the same for every query.
         retrieval_score: kind of retrieval score, see `mfvpr.evaluation.rankings.retrieval_scores`.
         weights: for "zscore" only, above 0, by name: of `retrieval` and of the main scorer, by default 1;
             and of further scorers, which take part only if they are named here.
@@ -106,8 +101,7 @@ class Fusion:
         known = ", ".join(scorers) or "there are none"
         if main not in scorers:
             raise InputError(f"fused: expected names of scorers ({known}), got {main}")
-        if self.c not in (None, "zscore") and not NOT_NEGATIVE.holds(self.c):
-            raise InputError(f"c={self.c!r}: expected {NOT_NEGATIVE.expected}, 'zscore', or None")
+        (NOT_NEGATIVE | "zscore" | None).check("c", self.c)
         if self.weights and self.c != "zscore":
             raise InputError(f"weights: expected c='zscore' as well, got c={self.c!r}")
         for name, weight in self.weights.items():
@@ -120,8 +114,7 @@ class Fusion:
         by_retrieval = retrieval_scores(candidates, self.retrieval_score)
         if self.c != "zscore":
             return np.asarray(fuse(by_retrieval, scores[main], candidates.mask, self.c))
-        parts = {RETRIEVAL: by_retrieval}
-        parts |= {name: scores[name] for name in self.members(main)}
+        parts = {RETRIEVAL: by_retrieval} | {name: scores[name] for name in self.members(main)}
         weights = np.array([self.weights.get(name, 1.0) for name in parts], np.float32)
         return np.asarray(fuse_scales(np.stack([*parts.values()], axis=-1), candidates.mask, weights))
 
@@ -134,43 +127,29 @@ class FrameCorrelation:
     strength * gain * (1 - d / reach) of its score; the largest gain over the previous queries counts. The strength is
     the score of that place over the best score of the previous places, and 1 if `previous` is 1 or all scores are 0.
     Queries and database images must be in the order of the drive.
-
-    Attributes:
-        previous: number of previous queries, from 1; the first `previous` queries keep their scores.
-        reach: database rows.
-        gain: largest relative increase of a score.
     """
 
-    previous: int = 2
-    reach: float = 15.0
-    gain: float = 0.4
+    previous: int = 2  # queries, from 1; the first ones keep their scores
+    reach: float = 15.0  # database rows
+    gain: float = 0.4  # largest relative increase of a score
 
     def __post_init__(self) -> None:
         if self.previous < 1 or not 0 < self.reach < np.inf or not 0 <= self.gain < np.inf:
-            expected = "at least one query, a finite reach above 0, a finite gain from 0"
-            raise InputError(f"{self}: expected {expected}")
+            raise InputError(f"{self}: expected at least one query, a finite reach above 0, a finite gain from 0")
 
     def __call__(self, candidates: Shortlist, scores: Scores) -> Scores:
-        """Correlated scores of a sequence, float32.
-
-        Scores that are not above 0, and NaN, stay the same. Among equal scores the lowest row is the query's place.
-        """
-
-        def gains(rows: np.ndarray, before: Float[np.ndarray, "previous 2"]) -> np.ndarray:
-            """Largest relative gains of rows; `before` are places and scores."""
-            places, scores = before.T
-            best = scores.max()
-            strength = scores / best if best > 0 and self.previous > 1 else np.ones(len(scores))
-            nearness = np.maximum(1 - np.abs(rows[:, None] - places) / self.reach, 0)
-            return self.gain * np.max(strength * nearness, axis=1, initial=0)
-
+        """Correlated scores of a sequence, float32; scores that are not above 0, and NaN, stay the same."""
         mask, correlated = np.asarray(candidates.mask), np.array(scores, np.float64)
         before: deque[tuple[float, float]] = deque(maxlen=self.previous)  # (row, score) of the last places
         for row_scores, rows, usable in zip(correlated, np.asarray(candidates.indices, float), mask, strict=True):
             positive = usable & (row_scores > 0)
             if len(before) == self.previous:
-                row_scores[positive] *= 1 + gains(rows[positive], np.array(before))
-            best = row_scores.max(where=positive, initial=0)
+                places, of_places = np.array(before).T
+                most = of_places.max()
+                strength = of_places / most if most > 0 and self.previous > 1 else np.ones(len(before))
+                nearness = np.maximum(1 - np.abs(rows[positive, None] - places) / self.reach, 0)
+                row_scores[positive] *= 1 + self.gain * np.max(strength * nearness, axis=1, initial=0)
+            best = row_scores.max(where=positive, initial=0)  # of equal ones, the lowest row is the place
             before.append((rows.min(where=positive & (row_scores == best), initial=np.inf), best))
         return correlated.astype(np.float32)
 
@@ -185,41 +164,14 @@ class FinalScore:
     step: "Fusion | FrameCorrelation | DriveFilter | None" = None
 
 
-def final_scores(
-    scorers: Sequence[str],
-    fused: Mapping[str, Fusion],
-    correlated: Mapping[str, FrameCorrelation],
-    sequences: "Mapping[str, Sequence[DriveFilter]]",
-) -> dict[str, FinalScore]:
-    """Final scores of a system by name, those that are made of other ones behind them; see `mfvpr.System`."""
-    scores = [FinalScore(RETRIEVAL), *(FinalScore(name, (name,)) for name in scorers)]
-    for name, fusion in fused.items():
-        fusion.check(name, scorers)
-        scores.append(FinalScore(fusion.system(name), tuple(fusion.members(name)), name, fusion))
-    known = {score.name: score.scorers for score in scores[1:]}
-    steps = [("correlated", name, FRAMES, correlation) for name, correlation in correlated.items()]
-    for name, filters in sequences.items():
-        steps += [("sequences", name, each.name, each) for each in filters]
-    for field_name, name, words, step in steps:
-        if name not in known:
-            names = ", ".join(known) or "there are none"
-            raise InputError(f"{field_name}: expected names of scorers ({names}), got {name}")
-        scores.append(FinalScore(f"{name} + {words}", known[name], name, step))
-    by_name = {score.name: score for score in scores}
-    if len(by_name) < len(scores):
-        twice = next(score.name for score in scores if by_name[score.name] is not score)
-        raise InputError(f"scorers: {twice} is the name of another system; choose another one")
-    return by_name
-
-
 def rank_by_scores(
     candidates: Shortlist,
     scores: Mapping[str, Scores],
-    final_scores: Collection[FinalScore],
+    final_scores: Iterable[FinalScore],
     ties: Ties,
     *,
     num_rows: int = 0,
-    excluded: Bool[np.ndarray, "queries database"] | None = None,
+    excluded: Positives | None = None,
 ) -> dict[str, Ranked]:
     """Rankings of queries by name of the final score, in the order of `final_scores`; a drive if it is a sequence.
 
@@ -234,16 +186,15 @@ def rank_by_scores(
         elif isinstance(score.step, FrameCorrelation):
             known[score.name] = score.step(candidates, known[score.base])
         elif score.step is not None:  # of a drive
-            rankings[score.name] = score.step(rankings[score.base], num_rows, excluded)
+            hidden = None if excluded is None else excluded.dense()
+            rankings[score.name] = score.step(rankings[score.base], num_rows, hidden)
             continue
         rankings[score.name] = Ranked.of(candidates, known[score.name], ties)
     return rankings
 
 
 def balancing_c(
-    retrieval_scores: Num[Array, " candidates"],
-    rerank_scores: Num[Array, " candidates"],
-    mask: Bool[Array, " candidates"],
+    retrieval_scores: OfQuery, rerank_scores: OfQuery, mask: Bool[Array, " candidates"]
 ) -> Float[jax.Array, ""]:
     """The c with which both scores of one query's candidates have the same standard deviation, in any unit.
 
@@ -275,10 +226,8 @@ def retrieval_scores(candidates: Shortlist, kind: RetrievalScore = "cosine") -> 
     if kind == "cosine":
         return cosine
     if (largest := np.max(cosine, initial=0, where=candidates.mask)) > 1 + 1e-3:
-        raise InputError(
-            f"retrieval_score=negative_euclidean: expected cosine similarities up to 1, got {largest:.4g}; use cosine, "
-            "which takes any score"
-        )
+        expected = f"cosine similarities up to 1, got {largest:.4g}; use cosine, which takes any score"
+        raise InputError(f"retrieval_score=negative_euclidean: expected {expected}")
     return -np.sqrt(np.maximum(2 - 2 * cosine, 0))
 
 
@@ -294,15 +243,16 @@ def fuse_scales(
     candidates, or 0 if all scores are equal. A score that is not finite is left out of mean and deviation, and affects
     only the sum of its own candidate.
     """
-    scores = at_least_single(scores)
     weights = jnp.ones(scores.shape[-1]) if weights is None else jnp.asarray(weights)
+
+    def fuse_query(scores: Float[Array, "candidates scales"], mask: Bool[Array, " candidates"]) -> Array:
+        standard = jax.vmap(_standardize, in_axes=(1, None), out_axes=1)(scores, mask)
+        standard = jnp.where(mask[:, None] & (weights != 0)[None], standard, 0.0)  # infinity times 0 would be NaN
+        fused = jnp.matmul(standard, weights.astype(scores.dtype), precision=jax.lax.Precision.HIGHEST)
+        return jnp.where(mask, fused, jnp.nan)
+
     mask = jnp.broadcast_to(mask, scores.shape[:-1])
-    standardize = jnp.vectorize(_standardize, signature="(c),(c)->(c)")
-    scores = jnp.moveaxis(standardize(jnp.moveaxis(scores, -1, -2), mask[..., None, :]), -2, -1)
-    counts = jnp.expand_dims(weights != 0, tuple(range(scores.ndim - 1)))
-    scores = jnp.where(mask[..., None] & counts, scores, 0.0)  # infinity times 0 would be NaN
-    fused = jnp.matmul(scores, weights.astype(scores.dtype), precision=jax.lax.Precision.HIGHEST)
-    return jnp.where(mask, fused, jnp.nan)
+    return jnp.vectorize(fuse_query, signature="(c,s),(c)->(c)")(at_least_single(scores), mask)
 
 
 def _standardize(scores: Float[Array, " candidates"], mask: Bool[Array, " candidates"]) -> Array:
@@ -326,7 +276,6 @@ def rank_shortlist(
     return np.asarray(rank(scores, candidates.mask, tie_break=tie_break))
 
 
-def _masked_std(values: Float[Array, "*shape"], mask: Bool[Array, "*shape"]) -> Float[jax.Array, ""]:
+def _masked_std(values: Float[Array, " candidates"], mask: Bool[Array, " candidates"]) -> Float[jax.Array, ""]:
     """Standard deviation of all real entries, with a gradient of 0 where it is 0; 0 where there are none."""
-    values, mask = values.reshape(-1), mask.reshape(-1)
     return safe_sqrt(masked_mean(masked(values - masked_mean(values, mask), mask) ** 2, mask))

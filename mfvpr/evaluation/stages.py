@@ -4,12 +4,13 @@ Files and threads stay on the host; each computation is one compiled program per
 """
 
 import itertools
+import math
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import nullcontext
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import partial
 from threading import Lock
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -57,6 +58,7 @@ STORE_BATCH = 8  # queries whose matches may be lost when a run is killed
 SHIFT_FLOOR = 0.03
 WORKER_MEMORY = 2.0  # GB, as several workers may share a machine
 
+Mask = Bool[np.ndarray, "queries candidates"]
 PaddedBatch = tuple[Int[np.ndarray, " _"], Matches]  # positions of its pairs, and their Matches [P, K, ...]
 
 
@@ -69,51 +71,47 @@ def score(
 ) -> dict[str, Scores]:
     """Scores, float32, by name of the scorer; NaN without a candidate, 0 without matches.
 
-    All scorers together are one program for each shape of a batch, which is reused for other parameter values
-    (histograms: up to the next multiple of 8 bins). Several scales are scored one by one and fused. The devices of
-    `runtime` share the batches, without effect on the bits of the scores.
+    All scorers together are one program for each shape of a batch, also for other parameter values (histograms: up to
+    the next multiple of 8 bins). Several scales are fused. Devices share the batches without effect on the bits.
     """
     if not scorers:
         return {}
     for scorer in scorers.values():
         check_host(scorer)
-    num_queries, sets = len(candidates.mask), scales(match_set)
+    sets, (num_queries, width) = scales(match_set), candidates.mask.shape
     size = queries_that_fit(match_set, len(scorers))
     parts = [range(start, min(start + size, num_queries)) for start in range(0, num_queries, size)]
     fitted = with_static_functions(fit_capacities(dict(scorers), *match_set.image_sizes, multiple=BIN_STEP))
-    scores = {name: np.zeros((len(sets), *candidates.mask.shape), np.float32) for name in scorers}
     total = sum(len(partition(scale_set, part, settings=1)) for scale_set in sets for part in parts)
-    run = partial(run_batches, _score_all, (fitted,), devices=runtime.devices)
-    scored = ((part, *batch) for part in parts for batch in run(all_batches(match_set, part, settings=1)))
-    for part, places, values in runtime.progress("scores")(scored, total):
-        scale, query, place = np.unravel_index(places, (len(sets), len(part), candidates.mask.shape[1]))
-        for name, pair_scores in values.items():
-            scores[name][scale, part.start + query, place] = pair_scores
-    fused = {name: fuse_all(match_set, by_scale, candidates.mask) for name, by_scale in scores.items()}
-    return {name: np.where(candidates.mask, values, np.nan) for name, values in fused.items()}
+    ticks = iter(runtime.progress("scores")(range(total), total))
+    scores = np.zeros((len(scorers), len(sets), num_queries, width), np.float32)
+    program = partial(_score_all, [*scorers])
+    for part in parts:
+        padded, of_part = all_batches(match_set, part, settings=1), scores[:, :, part.start : part.stop]
+        of_part[:] = pair_scores(program, (fitted,), padded, of_part.shape, runtime.devices, ticks)
+    next(ticks, None)  # ends the progress
+    fused = np.where(candidates.mask, fuse_all(match_set, scores, candidates.mask), np.nan)
+    return dict(zip(scorers, fused, strict=True))
 
 
-def all_batches(match_set: MatchSet | Scales, queries: range, *, settings: float) -> Iterator[PaddedBatch]:
-    """`match_set.batches` of q queries at every scale; positions are in the flattened `[S, q, C]`."""
-    for scale, scale_set in enumerate(scales(match_set)):
-        pairs = len(queries) * scale_set.counts.shape[1]
-        for places, matches in batches(scale_set, queries, settings=settings):
-            yield scale * pairs + places, matches
+def pair_scores(
+    program: Callable[..., Any],
+    inputs: tuple,
+    batches: Iterable[PaddedBatch],
+    shape: tuple[int, ...],
+    devices: Sequence[Device] | None,
+    ticks: Iterator[Any],
+) -> Float[np.ndarray, "rows scales queries candidates"]:
+    """Scores by a program that maps Matches `[P, K, ...]` and inputs to `[..., P]`, R rows; 0 without matches.
 
-
-def run_batches(
-    program: Callable[..., Any], inputs: tuple, batches: Iterable[PaddedBatch], *, devices: Sequence[Device] | None
-) -> Iterator[tuple[np.ndarray, Any]]:
-    """Run a program on every batch: (positions `[n]`, arrays `[..., n]`) in order, NumPy; devices take turns.
-
-    `program` takes Matches `[P, K, ...]` and the inputs, and returns arrays `[..., P]`.
+    Devices take turns, and each batch takes a tick.
     """
     to_device = [partial(jax.device_put, device=device) for device in devices or ()] or [lambda tree: tree]
     device_inputs = [put(inputs) for put in to_device]
     compiled_shapes: set[tuple] = set()
     compiling: dict[tuple, Lock] = {}
 
-    def run_batch(numbered: tuple[int, PaddedBatch]) -> tuple[np.ndarray, Any]:
+    def run_batch(numbered: tuple[int, PaddedBatch]) -> tuple[np.ndarray, np.ndarray]:
         number, (places, matches) = numbered
         device = number % len(to_device)
         key = device, matches.mask.shape
@@ -121,30 +119,44 @@ def run_batches(
         with nullcontext() if key in compiled_shapes else compiling.setdefault(key, Lock()):
             values = program(to_device[device](matches), *device_inputs[device])
         compiled_shapes.add(key)
-        return places, jax.tree.map(lambda leaf: np.asarray(leaf)[..., : len(places)], values)
+        return places, np.asarray(values)[..., : len(places)].reshape(shape[0], len(places))
 
     # A batch keeps only one core busy, so that one batch per core runs at the same time.
     workers = max(available_cpus(), len(to_device))
     run_all = partial(ordered_map, workers=workers) if knows_own_context() else map
-    return iter(run_all(run_batch, enumerate(batches)))
+    scores = np.zeros((shape[0], math.prod(shape[1:])), np.float32)
+    for places, values in run_all(run_batch, enumerate(batches)):
+        next(ticks, None)
+        scores[:, places] = values
+    return scores.reshape(shape)
+
+
+def all_batches(match_set: MatchSet | Scales, queries: range, *, settings: float) -> Iterator[PaddedBatch]:
+    """`match_set.batches` of q queries at every scale; positions are in the flattened `[S, q, C]`."""
+    for scale, scale_set in enumerate(scales(match_set)):
+        first = scale * len(queries) * scale_set.counts.shape[1]
+        for places, matches in batches(scale_set, queries, settings=settings):
+            yield first + places, matches
 
 
 def fuse_all(
-    match_set: MatchSet | Scales,
-    scores: Num[np.ndarray, "scales *batch queries candidates"],
-    mask: Bool[np.ndarray, "queries candidates"],
+    match_set: MatchSet | Scales, scores: Num[np.ndarray, "*batch scales queries candidates"], mask: Mask
 ) -> Float[np.ndarray, "*batch queries candidates"]:
     """Fused scores of all scales."""
     if not isinstance(match_set, Scales):
-        return scores[0]
+        return scores[..., 0, :, :]
     weights = None if match_set.weights is None else np.asarray(match_set.weights, np.float32)
-    return np.asarray(fuse_scales(np.moveaxis(scores, 0, -1), mask, weights))
+    return np.asarray(fuse_scales(np.moveaxis(scores, -3, -1), mask, weights))
 
 
-def _score_all(matches: Matches, scorers: dict[str, Scorer]) -> dict[str, Array]:
+def _score_all(
+    names: Sequence[str], matches: Matches, scorers: dict[str, Scorer]
+) -> Float[np.ndarray, "scorers pairs"]:
+    """Scores in the order of the names, which JAX sorts in dictionaries."""
     host_scorers = {name: scorer for name, scorer in scorers.items() if on_host(scorer)}
     scores = _in_jax(matches, {name: scorer for name, scorer in scorers.items() if name not in host_scorers})
-    return scores | {name: score_pairs(scorer, matches) for name, scorer in host_scorers.items()}
+    scores |= {name: score_pairs(scorer, matches) for name, scorer in host_scorers.items()}
+    return np.stack([np.asarray(scores[name], np.float32) for name in names])
 
 
 @compiled
@@ -168,11 +180,9 @@ def match(
 
     Args:
         queries: features of Q images; or the images, if that is what the matcher takes. The database likewise.
-        candidates: `[Q, C]` rows of the database.
         matcher: of one pair; one that runs on the host takes no part in a cluster.
         store: of these features, candidates and matcher. Queries that it lacks, or has with other candidates, are
             matched and written in small batches; the result is read from it.
-        runtime: devices that share the queries, memory, progress over queries, and workers that match for a store.
 
     Raises:
         InputError: the two sides' descriptors have different lengths, or the disk cannot be used.
@@ -189,19 +199,18 @@ def match(
         matched = [query for _, query in results]
         counts = np.array([query.counts for query in matched], np.int32).reshape(candidates.indices.shape)
         return MatchSet.of([query.matches for query in matched], counts)
+    stored, indices = store.read(), candidates.indices
     missing = [
-        row
-        for row, query in enumerate(store.read())
-        if query is None or not np.array_equal(query.indices, candidates.indices[row])
+        row for row, query in enumerate(stored) if query is None or not np.array_equal(query.indices, indices[row])
     ]
     if missing:
         results = runtime.map(_match_queries, shared, missing, "matching", QUERIES)
         together = 1 if is_on_host else STORE_BATCH  # on the host, a query may take minutes
         while batch := dict(itertools.islice(results, together)):
             store.write(batch)
-    if (stored := stored_matches(store, memory=runtime.memory)) is None:
+    if (complete := stored_matches(store, memory=runtime.memory)) is None:
         raise InputError(f"{store.folder}: matches were removed or damaged meanwhile; run again")
-    return stored[0]
+    return complete[0]
 
 
 def _match_queries(
@@ -239,8 +248,7 @@ def stored_matches(store: MatchStore, *, memory: float | None = None) -> tuple[M
     return MatchSet.of(matches or store, counts), Shortlist(indices, scores, indices >= 0)
 
 
-@dataclass(frozen=True)
-class Explanation:
+class Explanation(NamedTuple):
     """The histogram of one pair and its parts, NumPy."""
 
     histogram: ShiftHistogram  # all bins (-inf beyond the range of shifts) with their centers, px
@@ -249,20 +257,20 @@ class Explanation:
     peak: Float[Array, "2"]  # the refined peak between bin centers, px
     weights: Float[Array, " slots"]
     agrees: Bool[Array, " slots"]  # whether a shift lies within two standard deviations of the peak along both axes
-    direction: str  # of the shifts, as the scorer defines it
+    direction: Any  # of the shifts, as the scorer defines it
 
 
 def explain(scorer: HistogramOfShifts, matches: Matches) -> Explanation:
     """The parts of one pair's score, for figures and for steering; one program for all pairs."""
     fitted = fit_capacities(scorer, matches.image_size0, matches.image_size1, multiple=BIN_STEP)
-    return Explanation(*jax.tree.map(np.asarray, _explain(fitted, matches)), direction=scorer.direction)
+    return jax.tree.map(np.asarray, _explain(fitted, matches))._replace(direction=scorer.direction)
 
 
 @compiled
-def _explain(scorer: HistogramOfShifts, matches: Matches) -> tuple[Any, ...]:
+def _explain(scorer: HistogramOfShifts, matches: Matches) -> Explanation:
     shift, peak = scorer.dominant_shift(matches), scorer.dominant_shift(matches, refine=True)
-    weights = match_weights(scorer.weight, matches)
-    return scorer.histogram(matches), scorer(matches), shift, peak, weights, scorer.agrees(matches, peak)
+    weights, agrees = match_weights(scorer.weight, matches), scorer.agrees(matches, peak)
+    return Explanation(scorer.histogram(matches), scorer(matches), shift, peak, weights, agrees, None)
 
 
 def dominant_shifts(
@@ -274,18 +282,16 @@ def dominant_shifts(
     """Shifts from the center of a query to the same point in a candidate, with their intervals; one program.
 
     Returns:
-        Refined dominant shifts (candidate minus query), and their 95 % intervals (low, high); NaN if no match votes.
-        Half the width of an interval is that of `HistogramOfShifts.shift_interval` and `SHIFT_FLOOR` of the resized
-        query's longer side, in quadrature. Sizes (width, height) of the resized queries, px.
+        Refined dominant shifts (candidate minus query), and their 95 % intervals (low, high), NaN if no match votes:
+        `HistogramOfShifts.shift_interval` and `SHIFT_FLOOR` in quadrature. Sizes of the resized queries, px.
     """
     fitted = fit_capacities(scorer, *match_set.image_sizes, multiple=BIN_STEP)
-    shifts, intervals, sizes = (np.zeros((len(queries), *shape)) for shape in ((2,), (2, 2), (2,)))
+    parts = [(np.zeros((0, 2)), np.zeros((0, 2, 2)), np.zeros((0, 2)))]
     for start in range(0, len(queries), SHIFTS_AT_ONCE):
-        part = slice(start, min(start + SHIFTS_AT_ONCE, len(queries)))
+        part = slice(start, start + SHIFTS_AT_ONCE)
         pairs = match_set.pairs(queries[part], places[part], match_set.capacity, total=SHIFTS_AT_ONCE)
-        number = part.stop - start
-        shifts[part], intervals[part] = (values[:number] for values in pair_shifts(fitted, pairs))
-        sizes[part] = pairs.image_size0[:number]
+        parts.append((*pair_shifts(fitted, pairs), pairs.image_size0))
+    shifts, intervals, sizes = (np.concatenate(values)[: len(queries)] for values in zip(*parts, strict=True))
     return shifts, intervals, sizes
 
 

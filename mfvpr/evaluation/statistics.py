@@ -40,10 +40,9 @@ def estimate(hits: Bool[np.ndarray, " queries"]) -> Estimate:
 def recall_interval(hits: np.ndarray) -> tuple[float, float]:
     """95 % confidence interval of the recall of hits `[Q]` bool along a path, where neighbors fail together.
 
-    The interval of Clopper and Pearson (1934) for the effective number of independent queries, Q / `design_effect`. It
-    is nearly [0, 1] if the path is worth few, and (0, 1) without queries. In simulations with recalls of 0.5 to 0.95
-    and autocorrelations of the hits up to 0.9, it covers the recall in at least 90 %, and in less if noise of single
-    queries hides a slow change.
+    The interval of Clopper and Pearson (1934) for Q / `design_effect` independent queries; (0, 1) without queries. In
+    simulations with recalls of 0.5 to 0.95 and autocorrelations of the hits up to 0.9, it covers the recall in at least
+    90 %, and in less if noise of single queries hides a slow change.
     """
     hits = np.asarray(hits, bool)
     if hits.ndim != 1:
@@ -85,12 +84,10 @@ def mcnemar(first: np.ndarray, second: np.ndarray) -> McNemar:
 def path_test(first: np.ndarray, second: np.ndarray) -> PathTest:
     """Test of two systems' hits `[Q]` bool along a path: `mcnemar` for the effective number of independent queries.
 
-    The numbers of queries for which only one is correct are divided by the largest `design_effect` of the first hits,
-    the second hits, and their differences: noise of one system hides slow changes of the other in the differences. In
-    simulations of equally good systems with autocorrelations of the hits up to 0.9, p is at most 5 % in at most 5 %
-    (`mcnemar`: in up to 89 %), and in more if noise of single queries hides a slow change.
-
-    Sort the queries of several drives by their places.
+    That is by the largest `design_effect` of both systems' hits and of their differences, in which noise of one system
+    hides slow changes of the other. In simulations of equally good systems with autocorrelations of the hits up to 0.9,
+    p is at most 5 % in at most 5 % (`mcnemar`: in up to 89 %), and in more if noise of single queries hides a slow
+    change. Sort the queries of several drives by their places.
     """
     first, second = np.asarray(first, bool), np.asarray(second, bool)
     if first.ndim != 1 or first.shape != second.shape:

@@ -15,14 +15,14 @@ from mfvpr.core.scorer import Scorer, check_bounds
 from mfvpr.datasets.datasets import Dataset, ImageFolder
 from mfvpr.datasets.image_reading import read_size, shape_size
 from mfvpr.evaluation.drives import DriveFilter
-from mfvpr.evaluation.rankings import RETRIEVAL, FinalScore, FrameCorrelation, Fusion, Ties, final_scores
+from mfvpr.evaluation.rankings import FRAMES, RETRIEVAL, FinalScore, FrameCorrelation, Fusion, Ties
 from mfvpr.features.extractor import Extractor, Scale, Source
 from mfvpr.features.sift import Sift
 from mfvpr.matchers.host_matcher import PairSource
 from mfvpr.matchers.matcher import NEIGHBORS, LightGlueMatcher, Matcher
 from mfvpr.retrieval.retriever import Retriever, with_parts
 from mfvpr.utils.errors import InputError, require_word
-from mfvpr.utils.files import clip_middle
+from mfvpr.utils.fields import COUNT
 
 _TYPICAL_MATCHES = 1000  # of a pair that no features limit
 _SAME_ASPECT = 0.02  # relative difference of two aspect ratios that count as the same
@@ -43,8 +43,7 @@ class Pipeline:
         matcher: matches a pair, see `mfvpr.Matcher`; or a program of your own, see `mfvpr.HostMatcher`; or files, see
             `mfvpr.retrieval.MatchFiles`.
         candidates: number of candidates of each query.
-        pixels: of a resized image, in the shape of the first database image, which decides once; None = the
-            `image_size` of the extractor.
+        pixels: of a resized image, in the shape of the first database image; None = `image_size` of the extractor.
     """
 
     extractor: Extractor | Source
@@ -55,21 +54,16 @@ class Pipeline:
 
     def __post_init__(self) -> None:
         """Raise an InputError unless the parts fit together."""
-        number: Any = self.candidates
-        is_whole = isinstance(number, int | np.integer) and not isinstance(number, bool)
-        if not (number >= 1 if is_whole else isinstance(number, str) and number == "all"):
-            got = clip_middle(" ".join(repr(number).split()), 80)
-            raise InputError(f"candidates={got}: expected a whole number from 1, or 'all'")
+        (COUNT | "all").check("candidates", self.candidates)
         if not self.extractor.scales:
-            name = type(self.extractor).__name__
-            raise InputError(f"{name}: gives no local features; expected an extractor that does")
+            raise InputError(f"{type(self.extractor).__name__}: expected an extractor that gives local features")
         if isinstance(self.matcher, type) or not (callable(self.matcher) or isinstance(self.matcher, PairSource)):
             expected = "a function of the features of two images that returns Matches"
             raise InputError(f"matcher: expected {expected}, got {self.matcher!r}; see mfvpr.Matcher")
         if isinstance(self.matcher, LightGlueMatcher):
-            dimensions = [scale.dimension for scale in self.extractor.scales if scale.dimension]  # 0 = not known
-            if isinstance(self.extractor, Sift) or {*dimensions} - {self.matcher.dimension}:
-                got = f"{type(self.extractor).__name__} of {', '.join(map(str, dimensions))}"
+            dimensions = {scale.dimension for scale in self.extractor.scales if scale.dimension}  # 0 = not known
+            if isinstance(self.extractor, Sift) or dimensions - {self.matcher.dimension}:
+                got = f"{type(self.extractor).__name__} of {', '.join(map(str, sorted(dimensions)))}"
                 expected = f"ALIKED's features, of {self.matcher.dimension} dimensions"
                 raise InputError(f"LightGlue: expected {expected}, got {got}; match nearest neighbors instead")
 
@@ -85,9 +79,9 @@ class Pipeline:
         return self.extractor.scales if self.image_source is None else (Scale(0, _TYPICAL_MATCHES),)
 
     def size_for_images(self, folders: Iterable[ImageFolder], note: Note) -> tuple[int, int]:
-        """The image size (width, height) of about `pixels` in the shape of the first image.
+        """The image size (width, height) of about `pixels` in the shape of the first image that can be read.
 
-        `note` gets a line if images have another aspect ratio. Images that cannot be read do not count.
+        `note` gets a line if images have another aspect ratio.
         """
         assert self.pixels is not None
         shapes = {}
@@ -100,8 +94,8 @@ class Pipeline:
         first = next(iter(shapes.values()))
         size = shape_size(first, self.pixels, getattr(self.extractor, "side_multiple", 1))
         aspect = first[0] / first[1]
-        other = [path for path, shape in shapes.items() if abs(shape[0] / shape[1] / aspect - 1) > _SAME_ASPECT]
-        if other:
+        different = lambda shape: abs(shape[0] / shape[1] / aspect - 1) > _SAME_ASPECT  # noqa: E731
+        if other := [path for path, shape in shapes.items() if different(shape)]:
             got = f"{len(other)} of {len(shapes)} have another aspect ratio than the first, such as {other[0]}"
             note(f"images are resized to {size[0]} x {size[1]} px, but {got}: they are squashed")
         return size
@@ -121,14 +115,13 @@ class System:
     Attributes:
         pipeline: finds and matches candidates.
         scorers: by name.
-        fused: by name of a scorer, how its score is combined with the retrieval's (ranking `name + retrieval`), or with
-            other scorers' and the retrieval's (`name + other + retrieval`).
-        correlated: by name of a scorer or a fused ranking, how its scores are correlated with those of the queries
-            before (`name + frames`).
+        fused: by name of a scorer, how its score is combined with the retrieval's (ranking `name + retrieval`), and
+            with other scorers' (`name + other + retrieval`).
+        correlated: by name of such a ranking, how its scores depend on the queries before (`name + frames`).
         ties: equal scores keep the order of the retrieval, or go by the row of the database.
         final: name of the ranking that decides; None = that of the first scorer, or of the retrieval without scorers.
-        sequences: by name of a scorer or a fused ranking, how the queries of a drive are ranked with the help of each
-            other (`name + causal sequence`); the database must be in the order of a drive as well.
+        sequences: by name of such a ranking, how the queries of a drive are ranked together (`name + causal sequence`);
+            the database must be in the order of a drive as well.
         settings: that it was made from, by `mfvpr.load_system`; a map keeps them, so that `Map.open` needs no system.
     """
 
@@ -150,20 +143,34 @@ class System:
         if self.headline not in self.final_scores:
             raise InputError(f"final={self.final!r}: expected one of {', '.join(self.final_scores)}")
         if isinstance(self.final_scores[self.headline].step, DriveFilter):
-            reason = "as its first row may be no candidate; it is ranked beside the score that decides"
-            raise InputError(f"final={self.final!r}: a sequence cannot decide, {reason}")
+            raise InputError(f"final={self.final!r}: a sequence cannot decide, as its first row may be no candidate")
         for name, scorer in self.scorers.items():
-            is_class = isinstance(scorer, type)
-            if is_class or not callable(scorer):
-                got = f"the class {scorer.__name__}; write {scorer.__name__}(...)" if is_class else scorer
-                raise InputError(f"scorers: expected {name} to map Matches to a score, got {got}")
+            if isinstance(scorer, type) or not callable(scorer):
+                raise InputError(f"scorers: expected {name} to map Matches to a score, got {scorer!r}")
             if type(scorer) in SCORERS.values():
                 check_bounds(scorer)
 
     @cached_property
     def final_scores(self) -> dict[str, FinalScore]:
-        """Scores that candidates are ranked by, by name: of retrieval, of each scorer, and combined ones."""
-        return final_scores(tuple(self.scorers), self.fused, self.correlated, self.sequences)
+        """Scores that candidates are ranked by, by name, those that are made of other ones behind them."""
+        scores = [FinalScore(RETRIEVAL), *(FinalScore(name, (name,)) for name in self.scorers)]
+        for name, fusion in self.fused.items():
+            fusion.check(name, self.scorers)
+            scores.append(FinalScore(fusion.system(name), tuple(fusion.members(name)), name, fusion))
+        known = {score.name: score.scorers for score in scores[1:]}
+        steps: list[tuple[str, str, str, Any]] = []
+        steps += [("correlated", name, FRAMES, correlation) for name, correlation in self.correlated.items()]
+        steps += [("sequences", name, each.name, each) for name, filters in self.sequences.items() for each in filters]
+        for setting, name, words, step in steps:
+            if name not in known:
+                names = ", ".join(known) or "there are none"
+                raise InputError(f"{setting}: expected names of scorers ({names}), got {name}")
+            scores.append(FinalScore(f"{name} + {words}", known[name], name, step))
+        by_name = {score.name: score for score in scores}
+        for score in scores:
+            if by_name[score.name] is not score:
+                raise InputError(f"scorers: {score.name} is the name of another system; choose another one")
+        return by_name
 
     @property
     def headline(self) -> str:

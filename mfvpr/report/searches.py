@@ -21,7 +21,7 @@ from mfvpr.evaluation.statistics import Estimate, mcnemar, path_test, recall_int
 from mfvpr.report import runs
 from mfvpr.report.figures import panels, save_figure
 from mfvpr.report.runs import Figure, Table, format_estimate, format_interval, format_value, format_values
-from mfvpr.tuning.sweeps.setting_search import Outcome
+from mfvpr.tuning.sweeps import Outcome
 from mfvpr.utils.errors import InputError
 from mfvpr.utils.files import write_text
 from mfvpr.utils.fingerprints import versions
@@ -29,7 +29,7 @@ from mfvpr.utils.fingerprints import versions
 if TYPE_CHECKING:
     from pandas import DataFrame
 
-    from mfvpr.tuning.learning.comparison import Comparison  # with Optax and Orbax, which sweeps do not wait for
+    from mfvpr.tuning.learning.models import Comparison  # with Optax, which sweeps do not wait for
     from mfvpr.tuning.learning.training import Fit
 
 _PALE, _MARK = "#2fa8ff", "#e8482c"

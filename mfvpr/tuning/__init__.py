@@ -1,6 +1,6 @@
 """Search and learning of the parameters of re-ranking.
 
-Read first: sweeps/ (grids and Optuna, over whole data sets in compiled calls), learning/ (losses, training, match
+Read first: sweeps (grids and Optuna, over whole data sets in compiled calls), learning/ (losses, training, match
 weights).
 """
 

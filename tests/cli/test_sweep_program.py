@@ -14,7 +14,7 @@ from tests.programs import MFVPR, QUERIES, ROOT, job_of, settings_of, small
 
 pytestmark = pytest.mark.thorough
 
-SWEEP = sys.modules["mfvpr.tuning.sweeps.setting_rankings"]
+SWEEP = sys.modules["mfvpr.tuning.sweeps"]
 
 
 @pytest.fixture(scope="session")
@@ -128,8 +128,8 @@ def test_ctrl_c_keeps_what_is_finished_and_the_next_run_does_the_rest(
     interrupt(process)
     done, computed = list(store.glob("sweep-*/*/[!.]*.npz")), []
     assert 2 <= (finished := len(done) - before) < 6
-    scores = SWEEP.block_scores
-    monkeypatch.setattr(SWEEP, "block_scores", lambda *block: computed.append(1) or scores(*block))
+    scores = SWEEP.pair_scores
+    monkeypatch.setattr(SWEEP, "pair_scores", lambda *block: computed.append(1) or scores(*block))
     resumed = sweep(tmp_path / "out", *grid)
     assert len(computed) == (6 - finished) * QUERIES
     assert not list(store.glob("sweep-*/*/[!.]*.npz"))  # a finished sweep leaves none, which changed code could read

@@ -11,8 +11,8 @@ from mfvpr.evaluation import DriveFilter, Fusion, Ranked, statistics
 from mfvpr.features import Aggregated, Sift, VladFitting
 from mfvpr.retrieval import Retrieval
 from mfvpr.storage import FeatureCache
+from mfvpr.tuning import sweeps as rankings
 from mfvpr.tuning.sweeps import DriveRanking
-from mfvpr.tuning.sweeps import setting_rankings as rankings
 
 pytestmark = pytest.mark.slow
 
@@ -101,7 +101,7 @@ def test_files_are_whole_and_the_same_call_computes_nothing_again(sweep, swept, 
     assert (out / "table.csv").read_text() == result.table().csv()
     assert json.loads((out / "results.json").read_text())["axes"] == AXES
     assert [path.name for path in (out / "figures").iterdir()] == ["sigma_weight.png"]
-    monkeypatch.setattr(rankings, "block_scores", lambda *_: pytest.fail("computed again"))
+    monkeypatch.setattr(rankings, "pair_scores", lambda *_: pytest.fail("computed again"))
     assert str(sweep(MyScorer(), **AXES, split="both", out=out).table()) == str(result.table())
     with pytest.raises(mfvpr.InputError, match="has the result of a sweep of other axes"):
         sweep(MyScorer(), sigma=[5], out=out)
@@ -128,7 +128,7 @@ def test_a_system_that_ranks_by_a_fused_score_is_swept_by_it(sweep):
 @pytest.mark.parametrize(("scorer", "options", "words"), [
     (MyScorer(), {}, "sweep: expected at least one axis"),
     (MyScorer(), {"sgma": [1]}, "sgma: expected a parameter of MyScorer, of sigma, weight, max_distance, c"),
-    (MyScorer, {"sigma": [1]}, r"write MyScorer\(\.\.\.\)"),
+    (MyScorer, {"sigma": [1]}, r"got <class .*MyScorer"),
     (MyScorer(), {"sigma": [1], "out": __file__}, "out=.*: expected a new or empty folder"),
 ])  # fmt: skip
 def test_mistakes_are_one_line_before_any_work(dataset, monkeypatch, scorer, options, words):

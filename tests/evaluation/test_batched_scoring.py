@@ -16,7 +16,7 @@ from mfvpr.tuning import sweeps
 from tests import oracles
 from tests.programs import ROOT
 from tests.scorers import plain
-from tests.tuning.sweeps.test_sweep import CANDIDATES, QUERIES, make_set, rank
+from tests.tuning.test_sweep import CANDIDATES, QUERIES, make_set, rank
 
 pytestmark = pytest.mark.thorough
 
@@ -63,8 +63,8 @@ def devices_agree():
         return matches.mask.sum(axis=1)
 
     batches = stages.all_batches(match_set, range(QUERIES), settings=1)
-    for places, counts in stages.run_batches(program, (), batches, devices=devices):
-        np.testing.assert_array_equal(counts, match_set.counts.reshape(-1)[places])
+    counts = stages.pair_scores(program, (), batches, (1, 1, QUERIES, CANDIDATES), devices, iter(()))
+    np.testing.assert_array_equal(counts[0, 0], match_set.counts)
     assert {device for _, device in placed} == {*devices}
     assert {shape for shape, _ in placed} == {(2, 96)}
 

@@ -46,21 +46,20 @@ def ranking():
     return rank_by_scores(rng.gamma(2.0, 5.0, (30, 20)), rows)
 
 
-@pytest.mark.parametrize("apart", [0, 5])
-def test_inputs_are_those_of_loops_over_candidates(ranking, apart):
-    inputs = confidence_inputs(ranking, apart=apart)
+def test_inputs_are_those_of_loops_over_candidates(ranking):
+    inputs = confidence_inputs(ranking)
     for query, (rows, scores) in enumerate(zip(ranking.rows.tolist(), ranking.scores.tolist(), strict=True)):
         if rows[0] < 0:
             assert np.isnan(inputs[query]).all()
             continue
-        elsewhere = [score for row, score in zip(rows, scores, strict=True) if row >= 0 and abs(row - rows[0]) > apart]
+        elsewhere = [score for row, score in zip(rows, scores, strict=True) if row >= 0 and abs(row - rows[0]) > 5]
         every = [score for row, score in zip(rows, scores, strict=True) if row >= 0]
         squares = sum((score - statistics.fmean(elsewhere)) ** 2 for score in elsewhere) if elsewhere else 0
         spread = math.sqrt((squares + 2 * statistics.pvariance(every)) / (len(elsewhere) + 2))
         margin = math.log(1 + (scores[0] - max(elsewhere)) / spread) if elsewhere else math.inf
         height = math.log(1 + (scores[0] - statistics.fmean(elsewhere)) / spread) if elsewhere else math.inf
         np.testing.assert_allclose(inputs[query], [margin, height], rtol=1e-9)
-    assert np.isinf(inputs[4]).all() == (apart == 5)
+    assert np.isinf(inputs[4]).all()
 
 
 @pytest.mark.parametrize(("tolerance", "around"), [(0, 5), (1, 5), (2, 10)])
@@ -108,8 +107,8 @@ def test_where_all_answers_are_right_or_wrong_p_is_not_certain(correct):
 
 
 def test_what_is_written_is_read(ranking, tmp_path):
-    values = confidence_inputs(ranking, apart=3)
-    model = fit_confidence(values, values[:, 0] > 0.3, apart=3)
+    values = confidence_inputs(ranking)
+    model = fit_confidence(values, values[:, 0] > 0.3)
     assert np.isnan(model(ranking)).sum() == 1
     write_confidences(tmp_path / "confidence.json", {"histogram + retrieval": model}, {"dataset": "ä"})
     systems, recipe = read_confidences(tmp_path / "confidence.json")

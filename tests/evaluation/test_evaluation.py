@@ -14,7 +14,7 @@ from mfvpr.datasets import IndexFile
 from mfvpr.evaluation import Fusion, match_sequence
 from mfvpr.evaluation.dataset_ranking import KS
 from mfvpr.evaluation.statistics import path_test
-from mfvpr.features import Aggregated, Sift, VladFitting
+from mfvpr.features import Aggregated, VladFitting
 from mfvpr.io import write_features, write_global_descriptors, write_shortlist
 from mfvpr.report.evaluations import EvaluationReport, recall_table
 from mfvpr.report.run_files import write_gains
@@ -25,14 +25,11 @@ from mfvpr.storage import FeatureCache
 from mfvpr.utils import runtime
 from mfvpr.utils.fingerprints import fingerprint
 from tests.builders import evaluate_parts
+from tests.evaluation.conftest import SCORERS, SIFT, VLAD
 from tests.programs import typed
 from tests.storage.extractors import Mean
 
 pytestmark = pytest.mark.thorough
-
-SIFT = Sift(max_keypoints=60, image_size=(160, 120))
-VLAD = Retrieval(Aggregated(SIFT, VladFitting(num_words=8)))
-SCORERS = {"histogram": mfvpr.HistogramOfShifts(), "count": mfvpr.MatchCount()}
 
 
 @pytest.fixture(scope="module")

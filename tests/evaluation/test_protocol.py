@@ -67,14 +67,6 @@ def test_choosing_sees_no_candidate_of_a_reported_place():
     np.testing.assert_array_equal(second, indices >= QUERIES // 2 + TOLERANCES[-1])
 
 
-def test_fingerprints_tell_ground_truths_apart():
-    shifted = FrameTruth(tuple(((row + 1) % QUERIES,) for row in range(QUERIES)), QUERIES)
-    protocol = evaluation_protocol(TRUTH, TOLERANCES)
-    others = evaluation_protocol(TRUTH, (0, 1, 2)), evaluation_protocol(shifted, TOLERANCES)
-    assert protocol.fingerprint not in {other.fingerprint for other in others}
-    assert evaluation_protocol(TRUTH, TOLERANCES, "both").fingerprint == protocol.fingerprint
-
-
 def test_thresholds_ascend_and_the_middle_one_decides():
     protocol = evaluation_protocol(TRUTH, [3, 0, 1, 3])
     assert (protocol.thresholds, protocol.main, protocol.label(5, 1)) == ([0, 1, 3], 1, "R@5 ±1")

@@ -8,7 +8,6 @@ import pytest
 from PIL import Image
 
 import mfvpr
-from mfvpr.core.types import Shortlist
 from mfvpr.datasets import image_folder
 from mfvpr.evaluation import rankings, stages
 from mfvpr.features import Aggregated, Sift, VladFitting
@@ -18,9 +17,9 @@ from mfvpr.retrieval.search import EXACT
 from mfvpr.storage import FeatureCache
 from mfvpr.storage.cache_files import MatchStore
 from mfvpr.tuning.sweeps import rank_settings
-from tests.builders import match_set_of, random_matches
 from tests.scorers import FOREIGN, OWN, one_of_each_class, title
 from tests.storage.synthetic_features import assert_same_match_sets
+from tests.tuning.test_sweep import make_set
 
 pytestmark = pytest.mark.thorough
 
@@ -131,25 +130,13 @@ def test_numbers_cost_no_compilation_within_a_capacity(features, candidates, mat
     assert compilations.count == 1
 
 
-@pytest.fixture(scope="module")
-def mixed_sizes():
-    """Queries and candidates of two sizes, matches with a confidence."""
-    rng, queries, pairs_each, sizes = np.random.default_rng(5), 4, 3, ((336, 336), (640, 480))
-    pairs = [
-        [random_matches(rng, 30, sizes=(sizes[query % 2], sizes[place % 2])) for place in range(pairs_each)]
-        for query in range(queries)
-    ]
-    indices = np.tile(np.arange(pairs_each, dtype=np.int32), (queries, 1))
-    listed = Shortlist(indices, rng.random(indices.shape).astype(np.float32), indices >= 0)
-    return match_set_of(pairs, 64), listed
-
-
 @pytest.mark.first_case
 @pytest.mark.parametrize("scorer", one_of_each_class([*OWN, *FOREIGN]), ids=title)
-def test_every_scorer_on_images_of_two_sizes_with_a_confidence(mixed_sizes, scorer):
-    match_set, listed = mixed_sizes
+def test_every_scorer_on_images_of_two_sizes_with_a_confidence(scorer):
+    match_set, listed = make_set()
     got = stages.score({"it": scorer}, match_set, listed)["it"]
-    for query in range(len(got)):
-        np.testing.assert_allclose(got[query], mfvpr.score_candidates(scorer, match_set[query]), rtol=2e-6)
-    assert np.isfinite(got).all()
-    assert got.any()
+    for query, mask in enumerate(listed.mask):
+        expected = np.where(mask, mfvpr.score_candidates(scorer, match_set[query]), np.nan)
+        np.testing.assert_allclose(got[query], expected, rtol=2e-6)
+    assert np.isfinite(got[listed.mask]).all()
+    assert got[listed.mask].any()

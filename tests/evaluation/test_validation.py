@@ -76,7 +76,7 @@ def evaluate(dataset, extractor=SIFT, chosen=Fixed((0, 1, 2)), scorers=HISTOGRAM
 @pytest.mark.parametrize(
     ("options", "words"),
     [
-        *(({"candidates": wrong}, f"candidates={wrong!r}: expected .*'all'") for wrong in (0, "some", 2.5, True)),
+        *(({"candidates": wrong}, f"candidates={wrong}: expected .*all") for wrong in (0, "some", 2.5, True)),
         ({"ties": "indx"}, "ties='indx': expected one of retrieval, index"),
         ({"fused": {"nope": Fusion()}}, r"fused: .*\(histogram\), got nope"),
         ({"sequences": {"histogram": DriveFilter()}}, r"sequences: expected a list of DriveFilter"),
@@ -85,7 +85,7 @@ def evaluate(dataset, extractor=SIFT, chosen=Fixed((0, 1, 2)), scorers=HISTOGRAM
         ({"scorers": {"retrieval": mfvpr.MatchCount()}}, r"retrieval .*system"),
         ({"scorers": HISTOGRAM | {"histogram + retrieval": mfvpr.MatchCount()}, "fused": {"histogram": Fusion()}},
          r"histogram \+ retrieval .*system"),
-        ({"scorers": {"h": mfvpr.MatchCount}}, r"h .*the class MatchCount"),
+        ({"scorers": {"h": mfvpr.MatchCount}}, r"h .*got <class .*MatchCount"),
         ({"scorers": {"h": 5}}, r"scorers: .*h .*got 5"),
         ({"scorers": {"h": mfvpr.HistogramOfShifts(sigma=np.float32(-1.0))}}, "sigma=-1.0: expected a number from"),
         ({"scorers": {"v": lambda matches: matches.points0[:, 0]}}, "v: expected a number for each of"),
@@ -93,7 +93,7 @@ def evaluate(dataset, extractor=SIFT, chosen=Fixed((0, 1, 2)), scorers=HISTOGRAM
         ({"fused": {"histogram": Fusion(1.0, "euclidean")}}, "retrieval_score='euclidean': expected one of"),
         ({"fused": {"histogram": Fusion(1.0, "negative_euclidean")}, "chosen": Fixed((0, 1, 2), 3.0)},
          r"cosine .*1, got 3"),
-        *(({"fused": {"histogram": Fusion(wrong)}}, f"c={wrong!r}: expected a number from 0 to .*, 'zscore', or None")
+        *(({"fused": {"histogram": Fusion(wrong)}}, f"c={wrong}: expected a number from 0 to .*, or zscore, or null")
           for wrong in ("auto", np.nan, -1.0)),
         ({"fused": {"histogram": Fusion(weights={"retrieval": 2.0})}}, r"weights: .*c='zscore'.* got c=None"),
         ({"fused": {"histogram": Fusion("zscore", weights={"anchor": 1})}},

@@ -29,7 +29,7 @@ from tests.programs import snapshot
 pytestmark = pytest.mark.thorough
 
 SIFT, VLAD = Sift(max_keypoints=60, image_size=(160, 120)), VladFitting(num_words=8)
-SURE = Confidence(1, (0.0, 0.0), (1.0, 1.0), (1.0, 1.0), 0.0)
+SURE = Confidence((0.0, 0.0), (1.0, 1.0), (1.0, 1.0), 0.0)
 
 
 @pytest.fixture(scope="module")

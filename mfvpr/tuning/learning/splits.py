@@ -1,5 +1,6 @@
 """Queries to train on and to validate on, of one half of a path or of several joined data sets."""
 
+import itertools
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
@@ -106,11 +107,10 @@ def training_splits(
         raise InputError(f"split=None: expected first_half, second_half or both, {reason}")
     candidates = replace(candidates, scores=retrieval_scores(candidates, retrieval_score))
     splits = []
-    for half, name in zip(protocol.halves, protocol.names, strict=True):
+    for half, seen, name in zip(protocol.halves, protocol.of(candidates).views[1:], protocol.names, strict=True):
         paths = np.split(half.tune, np.cumsum(half.paths[:-1]).astype(int)) if half.paths else [half.tune]
         pieces = [np.split(path, [len(path) - round(VALIDATION * len(path))]) for path in paths]
         apart = separate(protocol.places, *(np.concatenate(parts) for parts in zip(*pieces, strict=True)))
-        seen = candidates.mask & half.allowed[np.maximum(candidates.indices, 0)]
         split = TrainingSplit(match_set, candidates, protocol, half, apart.tune, apart.report, seen, name)
         correct, incorrect = split.correct & split.usable, ~split.correct & split.usable
         has_both = np.asarray(correct.any(axis=1) & incorrect.any(axis=1))  # else the loss is 0 for any scores
@@ -169,26 +169,10 @@ def join_data_sets(teach: Sequence[Part], report: Sequence[Part]) -> Part:
     starts = zip(listed, np.cumsum([0, *databases[:-1]]), strict=True)
     indices = [np.where(each.mask, each.indices + start, -1).astype(np.int32) for each, start in starts]
     scores, mask = join([each.scores for each in listed], 0), join([each.mask for each in listed], False)
-    match_set = MatchSet(
-        _Joined([part.match_set.matches for part in parts], width),
-        join([part.match_set.counts for part in parts], 0),
-        max(part.match_set.capacity for part in parts),
-    )
+    matches = list[Matches]()
+    for of_query in itertools.chain.from_iterable(part.match_set.matches for part in parts):
+        of_candidates = {name: values for name, values in per_pair(of_query).items() if name.endswith("1")}
+        matches.append(replace(of_query, **{name: repeat_last(each, width) for name, each in of_candidates.items()}))
+    counts, capacities = join([part.match_set.counts for part in parts], 0), [part.match_set.capacity for part in parts]
+    match_set = MatchSet(matches, counts, max(capacities))
     return Part(" ".join(names), protocol, match_set, Shortlist(join(indices, -1), scores, mask))
-
-
-class _Joined(Sequence[Matches]):
-    """Matches of the queries of several sets, one set after the other; padded candidates have no matches."""
-
-    def __init__(self, parts: Sequence[Sequence[Matches]], width: int) -> None:
-        self._rows, self._width = [(part, row) for part in parts for row in range(len(part))], width
-
-    def __len__(self) -> int:
-        return len(self._rows)
-
-    def __getitem__(self, query: Any) -> Matches:
-        """Matches of one query; slices are not supported."""
-        part, row = self._rows[query]
-        matches = part[row]
-        of_candidates = {name: values for name, values in per_pair(matches).items() if name.endswith("1")}
-        return replace(matches, **{name: repeat_last(each, self._width) for name, each in of_candidates.items()})

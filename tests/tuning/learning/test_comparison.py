@@ -10,7 +10,7 @@ import pytest
 
 from mfvpr import AggregatedScore, HistogramOfShifts, InputError, MatchCount, RatioWeight, score_candidates
 from mfvpr.baselines.learned_weight import ABSOLUTE, LearnedWeight
-from mfvpr.tuning.learning import comparison
+from mfvpr.tuning.learning import models as comparison
 from mfvpr.tuning.learning.models import (
     LOSSES,
     Model,
@@ -164,8 +164,9 @@ def test_the_loss_is_that_of_a_loop():
 def test_it_finds_what_tells_right_matches_from_wrong_ones():
     taught, other = batch(), batch(seed=9)
     teachable = model(taught)
-    result = fit(teachable.start, teachable.objective(None), lambda _: taught, Schedule(optax.adam(0.05), steps=40))
     loss = jax.jit(teachable.objective(None))
+    schedule, validate = Schedule(optax.adam(0.05), steps=40), lambda learned: float(loss(learned, taught))
+    result = fit(teachable.start, teachable.objective(None), lambda _: taught, schedule, validate=validate)
     assert loss(result.parameters, other) < 0.85 * loss(teachable.start, other)
     learned = teachable.scorer_of(result.parameters)
     clear, doubtful = (

@@ -8,7 +8,7 @@ import pytest
 
 from mfvpr import HistogramOfShifts, InputError
 from mfvpr.core.types import per_match
-from mfvpr.tuning.learning import comparison
+from mfvpr.tuning.learning import models as comparison
 from mfvpr.tuning.learning.models import Options
 from mfvpr.tuning.learning.splits import VALIDATION, Part, join_data_sets, training_splits
 from mfvpr.tuning.sweeps import Axes

@@ -15,8 +15,7 @@ from mfvpr.evaluation import DriveFilter, rankings
 from mfvpr.matchers import Scales
 from mfvpr.matchers.match_set import shapes
 from mfvpr.tuning import sweeps
-from mfvpr.tuning.sweeps import DriveRanking
-from mfvpr.tuning.sweeps.setting_rankings import group_by_program
+from mfvpr.tuning.sweeps import DriveRanking, group_by_program
 from mfvpr.utils import InputError
 from tests.builders import match_set_of, random_matches
 from tests.scorers import FOREIGN, Sampled, Strongest, Wrapped, title
@@ -142,9 +141,9 @@ def test_views_hide_candidates_and_ties_may_go_by_index(data):
 @pytest.fixture
 def block_scores(monkeypatch):
     """Scores of every block that the test computes."""
-    computed, module = [], vars(sys.modules["mfvpr.tuning.sweeps.setting_rankings"])
-    scores = module["block_scores"]
-    monkeypatch.setitem(module, "block_scores", lambda *inputs: computed.append(scores(*inputs)) or computed[-1])
+    computed, module = [], vars(sys.modules["mfvpr.tuning.sweeps"])
+    scores = module["pair_scores"]
+    monkeypatch.setitem(module, "pair_scores", lambda *inputs: computed.append(scores(*inputs)) or computed[-1])
     return computed
 
 

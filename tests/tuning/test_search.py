@@ -13,12 +13,11 @@ from mfvpr.datasets import FrameTruth
 from mfvpr.evaluation import best_setting, evaluation_protocol, statistics
 from mfvpr.report import searches
 from mfvpr.tuning import sweeps as sweeping
-from mfvpr.tuning.sweeps import Axes
-from mfvpr.tuning.sweeps.setting_search import suggest_setting
+from mfvpr.tuning.sweeps import Axes, suggest_setting
 from tests.needs import needs
 from tests.scorers import Wrapped
 from tests.tuning.learning.paths import QUERIES, TOLERANCES, split
-from tests.tuning.sweeps.test_sweep import rank
+from tests.tuning.test_sweep import rank
 
 TRUTH = FrameTruth(tuple((row,) for row in range(QUERIES)), QUERIES)
 SUM = mfvpr.AggregatedScore()
