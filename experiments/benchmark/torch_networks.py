@@ -47,7 +47,9 @@ def run_network(
 
 def conv(w: Weights, name: str, x: Tensor, *, bias: bool = False, **options: int) -> Tensor:
     """Convolution by name."""
-    return F.conv2d(x, w(f"{name}.weight"), w(f"{name}.bias") if bias else None, **options)
+    weight = w(f"{name}.weight")
+    weight = weight[..., None, None] if weight.ndim == 2 else weight  # a product of matrices in mfvpr
+    return F.conv2d(x, weight, w(f"{name}.bias") if bias else None, **options)
 
 
 def batch_norm(w: Weights, name: str, x: Tensor) -> Tensor:

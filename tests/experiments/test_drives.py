@@ -13,7 +13,7 @@ from mfvpr.localization import Alternative, Prediction
 
 
 def test_shares_are_those_of_the_queries():
-    confidence = Confidence(5, (0.0,), (1.0,), (1.0,), 0.0)
+    confidence = Confidence((0.0,), (1.0,), (1.0,), 0.0)
     sure, unsure = 4.0, -4.0  # 0.98 and 0.02
     present = np.array([[sure], [sure], [unsure], [np.nan]]), np.array([True, False, True, False])
     elsewhere = np.array([[sure], [unsure], [unsure], [np.nan]]), np.zeros(4, bool)
