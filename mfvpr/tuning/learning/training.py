@@ -1,9 +1,13 @@
 """Gradient descent on a pytree of arrays, with validation, early stopping, and resuming to the bit."""
 
 import json
+import logging
 import math
+import shutil
 import warnings
-from collections.abc import Callable, Mapping
+import zlib
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -12,13 +16,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import optax
+import orbax.checkpoint as ocp
 
 from mfvpr.core.types import Array
-from mfvpr.storage.cache_files import Arrays, CacheFiles
 from mfvpr.utils.errors import InputError
+from mfvpr.utils.fingerprints import fingerprint
 from mfvpr.utils.runtime import Track, no_progress
-
-_KEY = "00state"  # of the file in the folder of a training
 
 
 class TrainingError(InputError):
@@ -69,6 +72,11 @@ class State:
     optimizer: Any  # state of the optimizer
     history: tuple[Record, ...] = ()
     losses: tuple[float, ...] = ()  # of the steps since the last record
+
+    @property
+    def arrays(self) -> tuple[Any, Any, Any]:
+        """The pytrees of arrays."""
+        return self.parameters, self.best, self.optimizer
 
     @property
     def step(self) -> int:
@@ -128,13 +136,10 @@ def fit(
 
     parameters = _strong(parameters)
     state = State(parameters, parameters, _strong(schedule.optimizer.init(parameters)))
-    files = checkpoints and _files(checkpoints, state)
-    stored = files and files.get(_KEY)
-    if files and not stored and _KEY in files:
-        warnings.warn(f"{files.path(_KEY)}: the checkpoint is damaged; the training starts again", stacklevel=2)
-    state = stored or add_record(state)
-    if files and state.step > steps:
-        got = f"the checkpoint in {files.folder} is of step {state.step}"
+    folder = checkpoints and checkpoints.folder / f"{checkpoints.name}-{fingerprint(checkpoints.recipe)}"
+    state = (folder and restore(folder, jax.tree.structure(state.arrays))) or add_record(state)
+    if state.step > steps:
+        got = f"the checkpoint in {folder} is of step {state.step}"
         raise InputError(f"steps={steps}: {got}; ask for more steps, or choose another folder")
     remaining = 0 if state.is_out_of(patience) else steps - state.step
     for step in track(range(state.step, state.step + remaining), remaining):
@@ -144,8 +149,8 @@ def fit(
         state = replace(state, parameters=learned, optimizer=memory, losses=(*state.losses, float(loss)))
         if is_due := state.step % every == 0:
             state = add_record(state)
-        if files and (is_due or state.step == steps):
-            files.update({_KEY: state})
+        if folder and (is_due or state.step == steps):
+            save_checkpoint(folder, state)
         if state.is_out_of(patience):
             break
     if state.losses:  # after the checkpoint: a training of more steps would not validate here
@@ -163,22 +168,67 @@ def _strong(tree: Any) -> Any:
     return jax.tree.map(lambda leaf: jnp.asarray(leaf, dtype=jnp.result_type(leaf)), tree)
 
 
-def _files(checkpoints: Checkpoints, start: State) -> CacheFiles[State]:
-    """The folder of a training's last state, whose trees are those of the start."""
-
-    def pack(state: State) -> Arrays:
-        arrays = {str(place): leaf for place, leaf in enumerate(jax.tree.leaves(_trees(state)))}
-        record = json.dumps([state.history, state.losses]).encode()
-        return arrays | {"record": np.frombuffer(record, np.uint8)}
-
-    def unpack(arrays: Arrays) -> State:
-        history, losses = json.loads(arrays["record"].tobytes())
-        leaves = [arrays[str(place)] for place in range(len(arrays) - 1)]
-        parameters, best, optimizer = _strong(jax.tree.unflatten(jax.tree.structure(_trees(start)), leaves))
-        return State(parameters, best, optimizer, tuple(Record(*row) for row in history), tuple(losses))
-
-    return CacheFiles(checkpoints.folder, checkpoints.name, checkpoints.recipe, pack, unpack)
+def save_checkpoint(folder: Path, state: State) -> None:
+    """Write a state, and remove the one before it."""
+    leaves = [np.asarray(leaf) for leaf in jax.tree.leaves(state.arrays)]
+    record = json.dumps([state.history, state.losses, _checksum(leaves)]).encode()
+    arrays = {str(place): leaf for place, leaf in enumerate(leaves)} | {"record": np.frombuffer(record, np.uint8)}
+    try:
+        with _manager(folder) as manager:
+            manager.save(state.step, args=ocp.args.StandardSave(arrays))
+    except (OSError, ValueError, RuntimeError) as error:  # TensorStore's, such as of a full disk
+        words = f"the checkpoint of step {state.step} cannot be written ({_reason(error)}); check the path and its disk"
+        raise InputError(f"{folder}: {words}") from None
 
 
-def _trees(state: State) -> tuple[Any, Any, Any]:
-    return state.parameters, state.best, state.optimizer
+def restore(folder: Path, structure: Any) -> State | None:
+    """The last state, whose arrays have this structure; None without one. A damaged one is removed, with a warning."""
+    if not folder.exists():
+        return None
+    try:
+        with _manager(folder) as manager:
+            if (step := manager.latest_step()) is None:
+                return None
+            arrays = dict(manager.restore(step, args=ocp.args.StandardRestore()))
+        history, losses, checksum = json.loads(arrays.pop("record").tobytes())
+        leaves = [arrays[str(place)] for place in range(len(arrays))]
+        if _checksum(leaves) != checksum:
+            raise ValueError("another checksum")
+        parameters, best, optimizer = _strong(jax.tree.unflatten(structure, leaves))
+    except PermissionError as error:
+        raise InputError(f"{folder}: the checkpoint cannot be read ({_reason(error)}); check its permissions") from None
+    except Exception as error:  # of any kind from Orbax and TensorStore
+        warnings.warn(
+            f"{folder}: the checkpoint is damaged ({_reason(error)}); the training starts again", stacklevel=3
+        )
+        shutil.rmtree(folder)
+        return None
+    return State(parameters, best, optimizer, tuple(Record(*row) for row in history), tuple(losses))
+
+
+@contextmanager
+def _manager(folder: Path) -> Iterator[ocp.CheckpointManager]:
+    """Orbax's manager, without its logs and warnings."""
+    logger = logging.getLogger("absl")
+    level = logger.level
+    logger.setLevel(logging.CRITICAL)
+    options = ocp.CheckpointManagerOptions(
+        max_to_keep=1,
+        enable_async_checkpointing=False,  # `save` returns when the checkpoint is on disk
+        cleanup_tmp_directories=True,  # of killed processes
+        save_root_metadata=False,
+    )
+    try:
+        manager = ocp.CheckpointManager(folder.absolute(), options=options)
+        with warnings.catch_warnings(action="ignore"), manager:
+            yield manager
+    finally:
+        logger.setLevel(level)
+
+
+def _reason(error: Exception) -> str:
+    return " ".join(str(error).partition("[")[0].split())[:200]
+
+
+def _checksum(leaves: list[np.ndarray]) -> int:
+    return zlib.crc32(b"".join(leaf.tobytes() for leaf in leaves))
