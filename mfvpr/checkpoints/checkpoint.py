@@ -11,14 +11,7 @@ from typing import Any, BinaryIO, ClassVar
 import numpy as np
 
 from mfvpr.io.containers import reading, shorten
-from mfvpr.io.object_files import (
-    NUMPY_MAGIC,
-    DataUnpickler,
-    Function,
-    open_torch_archive,
-    read_matlab,
-    read_objects,
-)
+from mfvpr.io.object_files import NUMPY_MAGIC, DataUnpickler, open_torch_archive, read_matlab, read_objects
 from mfvpr.utils.errors import InputError
 
 
@@ -82,11 +75,11 @@ class _TensorUnpickler(DataUnpickler):
     """Unpickler of tensors; their storages are empty until `_tensors` reads the values."""
 
     names: ClassVar[Mapping[str, Any]] = {
-        "torch._utils._rebuild_tensor_v2": Function(_view),
-        "torch._utils._rebuild_parameter": Function(lambda tensor, *_: tensor),
+        "torch._utils._rebuild_tensor_v2": _view,
+        "torch._utils._rebuild_parameter": lambda tensor, *_: tensor,
         "argparse.Namespace": _Dictionary,  # itself, since a pickle makes its instances without a call
-        **dict.fromkeys(("collections.OrderedDict", "_codecs.encode", "numpy.dtype"), Function(_Dictionary)),
-        **{f"numpy.{core}.multiarray.scalar": Function(_Dictionary) for core in ("core", "_core")},
+        **dict.fromkeys(("collections.OrderedDict", "_codecs.encode", "numpy.dtype"), _Dictionary),
+        **{f"numpy.{core}.multiarray.scalar": _Dictionary for core in ("core", "_core")},
         **{f"torch.{part}{kind}Storage": code for part in ("", "storage.") for kind, code in _CODES.items()},
     }
 

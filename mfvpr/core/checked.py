@@ -75,7 +75,7 @@ class RoundedQuery(Query):
     def neighbors(self, candidate: Features, cross_check: CrossCheck, *, with_second: bool) -> Neighbors:
         """Mutual neighbors as of `Query`; both images have slots."""
         query, candidate = jax.lax.stop_gradient((self, candidate))
-        rounded0, rounded1 = query.rounded, round_candidate(candidate)
+        rounded0, rounded1 = query.rounded, round_image(candidate)
 
         def in_single() -> Neighbors:
             return Query(query.features).neighbors(candidate, cross_check, with_second=with_second)
@@ -99,7 +99,8 @@ def prepare_query(
     query = ready(query)
     if choose_product(product, query, candidates, cross_check, chunk_size) == "float32":
         return Query(query)
-    return RoundedQuery(query, round_query(query))
+    rounded = round_image(query)
+    return RoundedQuery(query, rounded._replace(descriptors=rounded.descriptors.T))  # so the product is fast
 
 
 def choose_product(
@@ -110,22 +111,22 @@ def choose_product(
     On other devices than a CPU always float32: the bounds of this module do not hold there.
     """
     sides = query, candidates
-    lengths = {np.shape(side.descriptors)[-1] for side in sides}
     if product is not None:
         require_word("product", product, Product)
-    may_be_faster = product is not None or (min(lengths) >= LEAST_DIMENSIONS and has_bfloat16())
-    if not may_be_faster or product == "float32" or device_of(sides).platform != "cpu":
+    if product == "float32" or device_of(sides).platform != "cpu":
         return "float32"
+    lengths = {np.shape(side.descriptors)[-1] for side in sides}
     dtypes = {jax.eval_shape(at_least_single, side.descriptors).dtype for side in sides}
     can_be_compared = dtypes == {jnp.dtype(jnp.float32)} and len(lengths) == 1
-    if can_be_compared and cross_check == "mutual" and chunk_size == 1 and all(side.mask.shape[-1] for side in sides):
-        return "bfloat16"
-    if product == "bfloat16":
+    is_possible = can_be_compared and cross_check == "mutual" and chunk_size == 1
+    is_possible &= all(side.mask.shape[-1] for side in sides)
+    if product == "bfloat16" and not is_possible:
         raise ValueError(
             "product=bfloat16: expected cross_check=mutual, chunk_size=1, images with slots, and descriptors of one "
             "length in single or half precision; leave product out"
         )
-    return "float32"
+    is_faster = min(lengths) >= LEAST_DIMENSIONS and has_bfloat16()
+    return "bfloat16" if is_possible and (product is not None or is_faster) else "float32"
 
 
 class _Direction(NamedTuple):
@@ -148,14 +149,7 @@ class _Direction(NamedTuple):
         return jnp.where(self.nearest.similarity > -jnp.inf, count, 0)
 
 
-def round_query(features: Features) -> Rounded:
-    """Round a query, best once for all of its candidates: transposed, the product is fast."""
-    rounded = round_candidate(features)
-    return rounded._replace(descriptors=rounded.descriptors.T)
-
-
-def round_candidate(features: Features) -> Rounded:
-    """Round a candidate."""
+def round_image(features: Features) -> Rounded:
     rounded = features.descriptors.astype(jnp.bfloat16)
     # Converted back, `rounded` could be the descriptors again: XLA may leave out a pair of conversions.
     lost = features.descriptors - jax.lax.reduce_precision(features.descriptors, 8, 7)

@@ -180,20 +180,12 @@ def make_matches(
         mask=real,
         image_size0=features0.image_size,
         image_size1=features1.image_size,
-        index0=slot_numbers(features0),
+        index0=jnp.arange(features0.mask.shape[-1], dtype=jnp.int32),
         index1=index1,
-        count0=keypoint_count(features0),
-        count1=keypoint_count(features1),
+        count0=jnp.sum(features0.mask, dtype=jnp.int32),
+        count1=jnp.sum(features1.mask, dtype=jnp.int32),
         **optional,
     )
-
-
-def slot_numbers(features: Features) -> Int[Array, " keypoints"]:
-    return jnp.arange(features.mask.shape[-1], dtype=jnp.int32)
-
-
-def keypoint_count(features: Features) -> Int[Array, ""]:
-    return jnp.sum(features.mask, dtype=jnp.int32)
 
 
 def at_least_one(features: Features) -> Features:

@@ -27,13 +27,6 @@ def hits(
     return np.any(positives.contains(rows[..., :k]), axis=-1)
 
 
-def count_correct(
-    rows: Int[np.ndarray, "queries depth"], positives: Positives, ks: Sequence[int]
-) -> Int[np.ndarray, " ks"]:
-    """Number of queries with a positive among their first k."""
-    return np.array([hits(rows, positives, k).sum() for k in ks], int)
-
-
 def recall_at_k(
     order: Any, positives: Positives | Bool[Array, "queries database"], ks: Sequence[int]
 ) -> Float[np.ndarray, " ks"]:
@@ -58,7 +51,7 @@ def recall_at_k(
     if min(ks, default=1) < 1:
         raise InputError(f"ks: expected depths from 1, got {min(ks)}")
     sets = positives if isinstance(positives, Positives) else _Matrix(np.asarray(as_array(positives), bool))
-    return count_correct(order, sets, ks) / max(len(order), 1)
+    return np.array([hits(order, sets, k).sum() for k in ks], int) / max(len(order), 1)
 
 
 class _Matrix:

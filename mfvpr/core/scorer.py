@@ -6,7 +6,7 @@ with_parameters(scorer, {"inner.sigma": 10.0})              # a field of a part
 """
 
 from collections.abc import Callable, Mapping
-from dataclasses import fields, is_dataclass, replace
+from dataclasses import fields, replace
 from typing import Any, Protocol, TypeVar
 
 import jax
@@ -140,17 +140,6 @@ def whole_numbers(scorer: Any) -> set[str]:
     """Names of the numbers that are integers, such as indices, and must remain integers."""
     is_whole = lambda number: jnp.issubdtype(jnp.result_type(number), jnp.integer)  # noqa: E731
     return {name for name, number in numbers_by_name(scorer).items() if number is not None and is_whole(number)}
-
-
-def static_names(scorer: Any) -> set[str]:
-    """Dotted names of the static fields of a scorer, whose values select the compiled program."""
-    names = set()
-    for f in fields(scorer) if is_dataclass(scorer) else ():
-        if f.metadata.get("static"):
-            names.add(f.name)
-        else:
-            names |= {f"{f.name}.{name}" for name in static_names(getattr(scorer, f.name))}
-    return names
 
 
 def with_parameters(scorer: Any, values: Mapping[str, Any]) -> Any:

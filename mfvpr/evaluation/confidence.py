@@ -184,6 +184,8 @@ def confidence_from_json(values: Mapping[str, Any]) -> Confidence:
     is_finite = np.isfinite([*numbers.flat, values["bias"]]).all()
     if not (is_finite and min(*scale, *shares) > 0 and min(weights) >= 0 and max(shares) <= 1):
         raise ValueError("values that make no model")
+    if values.get("apart", APART) != APART:  # of an earlier version
+        raise ValueError(f"of rankings with apart={values['apart']}, not {APART}")
     return Confidence(bias=values["bias"], **vectors)
 
 

@@ -14,7 +14,7 @@ from typing import Any, Literal
 import numpy as np
 from jaxtyping import Float, Int
 
-from mfvpr.core.metrics import count_correct
+from mfvpr.core.metrics import hits
 from mfvpr.core.types import Shortlist
 from mfvpr.datasets.datasets import Dataset, ImageFolder, QuerySequence
 from mfvpr.datasets.positives import Positives
@@ -98,7 +98,7 @@ class RankedDataset:
         recalls = {}
         for name, rankings in self.systems.items():
             correct = [
-                [count_correct(ranking.rows, positives[sequence], ks) for positives in by_threshold]
+                [[hits(ranking.rows, each[sequence], k).sum() for k in ks] for each in by_threshold]
                 for sequence, ranking in enumerate(rankings)
             ]
             shape, queries = (len(rankings), len(by_threshold), len(ks)), [len(ranking.rows) for ranking in rankings]

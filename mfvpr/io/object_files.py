@@ -6,7 +6,7 @@ Nothing in a file is executed: a pickle may ask only for the names of an unpickl
 import io
 import pickle
 import zipfile
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import PurePosixPath, PureWindowsPath
 from typing import Any, BinaryIO, ClassVar
@@ -18,21 +18,6 @@ from mfvpr.io.containers import read_npy_header, shorten
 from mfvpr.utils.errors import InputError
 
 NUMPY_MAGIC = b"\x93NUMPY"
-
-
-class Function:
-    """Stand-in of a function or class that a pickle may call; a pickle cannot give it a state."""
-
-    __slots__ = ("_function",)
-
-    def __init__(self, function: Callable[..., Any]) -> None:
-        self._function = function
-
-    def __call__(self, *arguments: Any) -> Any:
-        return self._function(*arguments)
-
-    def __setstate__(self, state: Any) -> None:
-        raise InputError("a function has no state")
 
 
 class DataUnpickler(pickle.Unpickler):
@@ -57,7 +42,7 @@ class ArrayUnpickler(DataUnpickler):
     """Unpickler of NumPy's arrays among plain data; paths become text."""
 
     names: ClassVar = {
-        f"{module}.{name}": Function(stand_in)
+        f"{module}.{name}": stand_in
         for modules, name, stand_in in (
             # An empty array, which the pickle fills.
             (("numpy.core.multiarray", "numpy._core.multiarray"), "_reconstruct", lambda *_: np.ndarray(0, np.int8)),

@@ -13,12 +13,10 @@ from mfvpr.core.matching import (
     at_least_one,
     distance_ratio,
     filter_matches,
-    keypoint_count,
     make_matches,
     match_prepared,
     pairs_at_once,
     prepare_query,
-    slot_numbers,
     with_concrete_sizes,
 )
 from mfvpr.core.nearest import CrossCheck, Product, Query, largest_of, lines_of, products, ready
@@ -149,7 +147,7 @@ class LightGlueMatcher:
         assigned = assignment(self.weights, features0, features1, depth_confidence=self.depth_confidence)
         best1, best0 = largest_of(lines_of(assigned, axis=1)), largest_of(lines_of(assigned, axis=0))
         confidence = jnp.exp(best1.similarity)
-        mutual = best0.index[best1.index] == slot_numbers(features0)
+        mutual = best0.index[best1.index] == jnp.arange(features0.mask.shape[-1], dtype=jnp.int32)
         real = mutual & (confidence > self.filter_threshold) & (best1.similarity > -jnp.inf)
         ratio = distance_ratio(features0, features1)
         return make_matches(features0, features1, best1.index, real, confidence=confidence, ratio=ratio)
@@ -190,9 +188,9 @@ def soft_match(features0: Features, features1: Features, *, temperature: float |
         image_size0=features0.image_size,
         image_size1=features1.image_size,
         confidence=jnp.minimum(jnp.sum(rows * columns, axis=1), 1.0),  # rounding may exceed 1
-        index0=slot_numbers(features0),
-        count0=keypoint_count(features0),
-        count1=keypoint_count(features1),
+        index0=jnp.arange(features0.mask.shape[-1], dtype=jnp.int32),
+        count0=jnp.sum(features0.mask, dtype=jnp.int32),
+        count1=jnp.sum(features1.mask, dtype=jnp.int32),
     )
 
 

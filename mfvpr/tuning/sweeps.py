@@ -8,7 +8,7 @@ setting are kept in a file, and only settings that are missing are ranked.
 import itertools
 import math
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field, is_dataclass, replace
+from dataclasses import dataclass, field, fields, is_dataclass, replace
 from functools import cached_property, lru_cache
 from importlib.util import find_spec
 from operator import attrgetter, itemgetter
@@ -29,7 +29,6 @@ from mfvpr.core.scorer import (
     fit_capacities,
     numbers_by_name,
     parameters_of,
-    static_names,
     whole_numbers,
     with_parameters,
     with_static_functions,
@@ -87,7 +86,7 @@ class Axes:
     def __post_init__(self) -> None:
         scorer = self.scorer
         refuse_own_names(scorer, self.values, reserved=(*MATCH_AXES, FUSION))
-        known = sorted({*numbers_by_name(scorer), *static_names(scorer), *self.parameters})
+        known = sorted({*numbers_by_name(scorer), *_static_names(scorer), *self.parameters})
         known += ["weight"] if hasattr(scorer, "weight") and "weight" not in known else []
         values = {}
         for name, axis in self.values.items():
@@ -485,7 +484,7 @@ def group_by_program(
     scorer: Any, settings: Sequence[Setting], image_sizes: tuple[np.ndarray, np.ndarray]
 ) -> Iterator[Group]:
     """Group settings, with the same names in each, by program: each value of a static parameter, and None, has one."""
-    static, integers = static_names(scorer), {*whole_numbers(scorer), "weight"}
+    static, integers = _static_names(scorer), {*whole_numbers(scorer), "weight"}
     weights = {id(setting["weight"]): setting["weight"] for setting in settings if "weight" in setting}
     numbers = {key: number for number, key in enumerate(weights)}  # of match weights, which take the place of them
     plain = [{**each, "weight": numbers[id(each["weight"])]} if weights else each for each in settings]
@@ -524,3 +523,14 @@ def _parts(total: int, size: int) -> list[np.ndarray]:
     """Parts of range(total) of one length, at most `size`; the last part repeats its last number."""
     length = -(-total // -(-total // size))
     return [np.minimum(np.arange(start, start + length), total - 1) for start in range(0, total, length)]
+
+
+def _static_names(scorer: Any) -> set[str]:
+    """Dotted names of the static fields of a scorer, whose values select the compiled program."""
+    names = set()
+    for f in fields(scorer) if is_dataclass(scorer) else ():
+        if f.metadata.get("static"):
+            names.add(f.name)
+        else:
+            names |= {f"{f.name}.{name}" for name in _static_names(getattr(scorer, f.name))}
+    return names

@@ -30,9 +30,14 @@ rounded_once = jax.jit(
 WORTHWHILE_CHECKS = checked.WORTHWHILE_CHECKS
 
 
+def transposed(query):
+    rounded = checked.round_image(query)
+    return rounded._replace(descriptors=rounded.descriptors.T)
+
+
 def round_query(query):
     query = ready(query)
-    return checked.RoundedQuery(query, checked.round_query(query))
+    return checked.RoundedQuery(query, transposed(query))
 
 
 def match_rounded(query, candidate):
@@ -151,7 +156,7 @@ def test_the_bound_holds_and_is_needed(monkeypatch):
 def test_rounded_products_stay_within_the_bound(dimensions):
     rng = np.random.default_rng(dimensions)
     query, candidate = (make_features(rng, 60, dimension=dimensions, garbage=0) for _ in range(2))
-    sides = checked.round_query(query), checked.round_candidate(candidate)
+    sides = transposed(query), checked.round_image(candidate)
     products = np.asarray(sides[1].descriptors, np.float64) @ np.asarray(sides[0].descriptors, np.float64)
     exact = candidate.descriptors.astype(np.float64) @ query.descriptors.T.astype(np.float64)
     direction = checked._direction(jnp.asarray(products, jnp.float32), 0, *sides)
@@ -162,7 +167,7 @@ def test_rounded_products_stay_within_the_bound(dimensions):
 
 mutual_neighbors = jax.jit(
     lambda query, candidate, with_second: checked.mutual_neighbors(
-        checked.round_query(query), checked.round_candidate(candidate), with_second=with_second
+        transposed(query), checked.round_image(candidate), with_second=with_second
     ),
     static_argnames="with_second",
 )
@@ -186,7 +191,7 @@ def test_sums_are_checked_where_bfloat16_loses_nothing():
         assert settled
         products = numpy_products(rows0, rows1)[0]
         assert int(neighbors.match[0]) == int(products.argmax())
-        summed = checked._products(checked.round_query(pair[0]), checked.round_candidate(pair[1]))
+        summed = checked._products(transposed(pair[0]), checked.round_image(pair[1]))
         wrong += int(np.argmax(summed[:12, 0]) != products.argmax())
     assert wrong > 0  # or no sum had to be checked
 
@@ -210,7 +215,7 @@ def test_equal_and_nearly_equal_images_are_left_to_float32(kind, monkeypatch):
         np.testing.assert_array_equal(rounded.mask, mask)
         np.testing.assert_array_equal(np.asarray(rounded.index1)[mask], np.asarray(in_single.index1)[mask])
     monkeypatch.setattr(checked, "WORTHWHILE_CHECKS", WORTHWHILE_CHECKS)
-    rounded = round_query(query).rounded, checked.round_candidate(ready(candidate))
+    rounded = round_query(query).rounded, checked.round_image(ready(candidate))
     _, settled = jax.jit(partial(checked.mutual_neighbors, with_second=False))(*rounded)
     assert settled == (kind not in ("twins", "near twins", "equal", "three times"))
 
