@@ -336,7 +336,7 @@ def _matches_of(file: Path, result: Mapping[str, Any], verified: bool) -> FileMa
         if first in parts and second in parts:
             return FileMatches(parts[first], parts[second], parts.get(confidence), sizes)
     if not verified and {*_NUMBERED[:3]} <= parts.keys():
-        points0, points1, numbers, confidence = (parts.get(name) for name in _NUMBERED)
+        (points0, points1, numbers), confidence = (parts[name] for name in _NUMBERED[:3]), parts.get(_NUMBERED[3])
         real = numbers >= 0
         lengths = {points0.shape[0], len(numbers), len(numbers if confidence is None else confidence)}
         if len(lengths) > 1 or numbers.dtype.kind not in "iu" or (numbers[~real] != -1).any():

@@ -52,7 +52,7 @@ def test_signs_and_axes(tmp_path):
     plan = plan_network(lambda rngs: VggNetVlad(4, 3, original=True, rngs=rngs))
     parameters = convert(read, NETVLAD_MATLAB, plan.shapes)
     np.testing.assert_array_equal(parameters["pool.centers"], -read["net.layers.30.weights.1"].T)
-    np.testing.assert_array_equal(parameters["pool.assignment.kernel"][0, 0], read["net.layers.30.weights.0"])
+    np.testing.assert_array_equal(parameters["pool.assignment.kernel"], read["net.layers.30.weights.0"])
     np.testing.assert_array_equal(parameters["projection.kernel"], read["net.layers.33.weights.0"][0, 0])
     np.testing.assert_array_equal(parameters["vgg.conv2_1.kernel"], read["net.layers.5.weights.0"])
     np.testing.assert_allclose(parameters["average"], [123.68, 116.779, 103.939], rtol=1e-6)
