@@ -146,8 +146,7 @@ class GlobalDescriptor(NetworkExtractor):
         return descriptors if self.components is None else of_unit_length(descriptors[:, : self.components])
 
 
-@dataclass(frozen=True)
-class KeypointNetwork(NetworkExtractor):
+class KeypointNetwork(NetworkExtractor):  # no dataclass, so that `max_keypoints` is the last field
     """Base of the extractors of keypoints; the result of a network is a tuple of `Detections`, as of several scales."""
 
     has_vector = False

@@ -338,8 +338,8 @@ def _matches_of(file: Path, result: Mapping[str, Any], verified: bool) -> FileMa
     if not verified and {*_NUMBERED[:3]} <= parts.keys():
         (points0, points1, numbers), confidence = (parts[name] for name in _NUMBERED[:3]), parts.get(_NUMBERED[3])
         real = numbers >= 0
-        lengths = {points0.shape[0], len(numbers), len(numbers if confidence is None else confidence)}
-        if len(lengths) > 1 or numbers.dtype.kind not in "iu" or (numbers[~real] != -1).any():
+        shapes = {points0.shape[:1], numbers.shape, (numbers if confidence is None else confidence).shape}
+        if len(shapes) > 1 or numbers.dtype.kind not in "iu" or (numbers[~real] != -1).any():
             raise InputError(
                 f"{file}: expected matches [N] of keypoints0 [N, 2], a row of keypoints1 or -1, got others"
             )

@@ -193,7 +193,10 @@ def test_confidences_of_all_pairs_or_of_none(tmp_path):
         ({"points0": POINTS, "points1": POINTS, "image_size0": [64, 64]}, "image_size0 and image_size1"),
         ({"points0": POINTS, "points1": POINTS, "im_size": 128}, "the argument image_size="),
         (SUPERGLUE | {"match_confidence": [0.5, 0.5]}, r"expected matches \[N\]"),
-        *((SUPERGLUE | {"matches": each}, "expected matches") for each in ([0, 1], [3, -1, 0], [-2, 0, 1])),
+        *(
+            (SUPERGLUE | {"matches": each}, "expected matches")
+            for each in ([0, 1], [3, -1, 0], [-2, 0, 1], [[2], [-1], [0]])
+        ),
     ],
 )
 def test_arrays_that_are_no_matches(tmp_path, arrays, message):
