@@ -103,7 +103,7 @@ def compose_data_sets(data_sets: list[Any]) -> list[dict[str, Any]]:
         for name, values in ({each: {}} if isinstance(each, str) else each).items():
             config = compose("learn", [f"dataset={name}", *_overrides(values or {}, "dataset.")]).dataset
             if missing := sorted(OmegaConf.missing_keys(config)):
-                raise InputError(f"dataset.{missing[0]}: expected a value of {name}")
+                raise InputError(f"{missing[0]}: expected a value of {name}")
             settings: Any = OmegaConf.to_container(config, resolve=True)
             schema.check_data_set(settings)
             composed.append(settings)
