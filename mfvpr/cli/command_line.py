@@ -103,7 +103,7 @@ def compose_data_sets(data_sets: list[Any]) -> list[dict[str, Any]]:
         for name, values in ({each: {}} if isinstance(each, str) else each).items():
             config = compose("learn", [f"dataset={name}", *_overrides(values or {}, "dataset.")]).dataset
             if missing := sorted(OmegaConf.missing_keys(config)):
-                raise InputError(f"dataset.{missing[0]}: expected a value of {name}")
+                raise InputError(f"{missing[0]}: expected a value of {name}")
             settings: Any = OmegaConf.to_container(config, resolve=True)
             schema.check_data_set(settings)
             composed.append(settings)
@@ -129,12 +129,13 @@ def load_system(name: str | Path = "mfvpr", **settings: Any) -> System:
     if not str(name).endswith(".json"):
         composed = compose("evaluate", [*_overrides({"system": str(name)} | settings)])
         values: Any = OmegaConf.to_container(composed, resolve=True)
+        chosen = from_values(schema.Evaluate, values)
     elif settings:
         raise InputError(f"{name}: expected no other settings, got {', '.join(settings)}; load a system by name")
     else:
         with reading(Path(name), "the run.json of a run of mfvpr evaluate"):
-            values = json.loads(Path(name).read_text(encoding="utf-8"))["settings"]
-    return assembly.system(from_values(schema.Evaluate, values))
+            chosen = from_values(schema.Evaluate, json.loads(Path(name).read_text(encoding="utf-8"))["settings"])
+    return assembly.system(chosen)
 
 
 def override(name: str, value: Any) -> str:

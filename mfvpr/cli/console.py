@@ -43,7 +43,7 @@ def one_line() -> Iterator[None]:
         refuse(str(error))
     except Exception as error:
         if reason := explain(error):
-            refuse(reason)
+            refuse(f"{reason.removesuffix('.')}; see --help")
         if isinstance(error, OSError):
             refuse(f"{error.filename or 'input or output'}: {error.strerror or error}")
         raise

@@ -95,9 +95,8 @@ def query_rows(queries: int | list[int | str], dataset: Dataset) -> int | list[i
     rows = [names.get(query, -1) if isinstance(query, str) else query for query in queries]
     for query, row in zip(queries, rows, strict=True):
         if not 0 <= row < len(names):
-            raise InputError(
-                f"figures=[{query}]: expected rows from 0 to {len(names) - 1}, or names such as {next(iter(names))}"
-            )
+            expected = f"rows from 0 to {len(names) - 1}, or names such as {next(iter(names))}"
+            raise InputError(f"figures=[{query}]: expected {expected}")
     return list(dict.fromkeys(rows))
 
 
@@ -111,9 +110,8 @@ def fitting_confidences(
     fitted, origin = read_confidences(expand_user(path))
     scores, deciding = system.final_scores, system.headline
     if deciding not in fitted:
-        raise InputError(
-            f"confidence={path}: expected one of {deciding}, which decides, got {', '.join(fitted) or 'none'}"
-        )
+        got = ", ".join(fitted) or "none"
+        raise InputError(f"confidence={path}: expected one of {deciding}, which decides, got {got}")
     made = {**(origin.get("settings") or {}), "candidates": origin.get("candidates")}
     now = {**settings, "scorer": assembly.describe_settings(settings["scorer"])}
     other = {}

@@ -131,6 +131,8 @@ def dataset_of(settings: Mapping[str, Any]) -> Dataset:
         if (settings.get(name) is not None) != (kind == reader):
             expected = f"dataset.{name}=FILE" if kind == reader else f"no dataset.{name}, which is for {reader}"
             raise InputError(f"dataset.ground_truth={kind}: expected {expected}")
+    if several and kind == "label":  # names of several folders may be the same
+        raise InputError(f"dataset.ground_truth=label: expected one folder of queries, got {settings['queries']}")
     truth = kind
     if kind == "index":
         truth = IndexFile(expand_user(settings["index_file"]), settings["widen_index"])

@@ -40,6 +40,8 @@ def sweep_program(settings: Settings) -> None:
         axes, watch = axes_of(settings), Stopwatch()
         if settings.search == "optuna":
             require_optuna()
+        elif axes.size > 1_000_000:
+            raise InputError(f"grid: expected at most 1,000,000 settings, got {axes.size:,}")
         inputs = prepare(settings, watch)
         settings, protocol = inputs.settings, inputs.protocol(settings.split)
         matches, candidates = inputs.match()

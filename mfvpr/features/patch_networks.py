@@ -8,7 +8,6 @@ from dataclasses import dataclass
 from typing import Any, Literal
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
@@ -65,13 +64,13 @@ class Dinov2Features(NetworkExtractor):
         return (Scale(self.model.dimension, (width // PATCH) * (height // PATCH)),)
 
     def compute(self, model: VisionTransformer, images: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
-        """Global descriptors `[B, D]`, local descriptors `[B, rows, columns, D]` and scores `[B, rows, columns]`."""
+        """Global descriptors `[B, D]`, local ones `[B, rows, columns, D]` and attention `[B, rows, columns]`."""
         tokens, output = model.with_block(model.preprocess(images), self.block)
-        scores = output.attention / jnp.max(output.attention, axis=(1, 2), keepdims=True)
-        return of_unit_length(tokens.class_token), of_unit_length(getattr(output, self.facet)), scores
+        return of_unit_length(tokens.class_token), of_unit_length(getattr(output, self.facet)), output.attention
 
     def describe_result(self, result: tuple[np.ndarray, np.ndarray, np.ndarray]) -> Description:
-        vector, local, scores = result
+        vector, local, attention = result
+        scores = attention / np.max(attention)  # here, so that the largest is 1
         row, column = np.nonzero(scores >= self.threshold)
         keypoints = _MIDDLE + PATCH * np.stack([column, row], axis=1)
         features = local_features(keypoints, local[row, column], self.image_size, scores[row, column])

@@ -262,7 +262,7 @@ def _write_search_page(folder: Path, results: Mapping[str, Any], path: Path) -> 
     title, _, words = heading.partition(": ")
     settings = {name: value for name, value in results.items() if name not in _IN_TABLES}
     found = {"text": summary.removeprefix(heading).strip(), "images": figures, "tables": tables}
-    parts = {"Results": found, "Settings and versions": {"tables": {"Run": settings}}}
+    parts = {"Results": found} | ({"Settings and versions": {"tables": {"Run": settings}}} if settings else {})
     write_page(path, title=title, words=words, facts={}, parts=parts)
 
 

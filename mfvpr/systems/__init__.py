@@ -1,1 +1,1 @@
-"""Systems from settings: `choices` has the settings of each choice, `assembly` makes a System of them."""
+"""Systems from settings: `assembly` has the settings of each choice, and makes a System of them."""

@@ -119,9 +119,8 @@ def choices_of(group: str) -> dict[str, dict[str, Any]]:
     """Settings of a group by choice and name. `name` in a group's settings, or `method` of a scorer, is the choice."""
     known, files = dict[str, dict[str, Any]](), settings_of(_Files)
     for name, (owner, weights) in NETWORKS.get(group, {}).items():
-        known[name] = {"weights": Setting(weights, TEXT, _LIST)} | without(
-            settings_of(getattr(features, owner)), "whitening"
-        )
+        own = without(settings_of(getattr(features, owner)), "whitening")
+        known[name] = {"weights": Setting(weights, TEXT, _LIST), **own}
     if "ssm" in known:
         known["ssm"] |= settings_of(WindowFitting)
     if group == "features":
@@ -219,6 +218,9 @@ class SystemSettings:
             check = self.matching.get("cross_check", self.matching["name"])
             if check != "candidate":
                 raise InputError(f"matching.cross_check={check}: expected candidate, so that every cell has a match")
+            cells = [(-(-pixels // 8) - 3) // local.get("stride", 1) + 1 for pixels in local["image_size"] or []]
+            if local["name"] == "ssm" and cells != [self.scorer["side"]] * 2:
+                raise InputError(f"scorer.side={self.scorer['side']}: expected the {cells} cells of the images")
         if local["name"] == "patch_netvlad":  # of whose patches the scorer `rapid` takes the largest place
             sides = local["image_size"]
             largest = [[16 * (pixels // 16 - patch) for pixels in sides] for patch in local["patch_sizes"]]
@@ -252,9 +254,8 @@ def retriever(
     """The retrieval of candidates; VLAD aggregates the local features that are matched as well."""
     name, options = settings["name"], without(settings, "name", "whiten")
     if name == "pairs":
-        return retrieval.ShortlistFiles(
-            _files("retrieval", {"database": None, **settings}, data), settings["database_prefix"]
-        )
+        files = _files("retrieval", {"database": None, **settings}, data)
+        return retrieval.ShortlistFiles(files, settings["database_prefix"])
     if name == "ssm":
         return retrieval.SsmVoting(_network_extractor("retrieval", name, options))
     search = EXACT if settings["whiten"] is None else retrieval.WhitenedSearch(settings["whiten"])
@@ -328,7 +329,7 @@ def _files(group: str, settings: Mapping[str, Any], data: Dataset | None) -> dic
         file = File(path, settings["query_prefix"])
         if files.setdefault(root, file) != file:
             raise InputError(
-                f"{group}.queries={path}: expected the file and the prefix of {group}.database, as of {root}"
+                f"{group}.queries={path}: expected file and prefix of {group}.database, both are of {root}"
             )
     return files
 

@@ -10,6 +10,8 @@ from tests.programs import ROOT, composed, run, small
 pytestmark = pytest.mark.thorough
 
 OWN = ("dataset=folder", "dataset.database=a", "dataset.queries=b")
+LABELS = (*OWN, "dataset.ground_truth=label", "dataset.query_labels=c", "dataset.database_labels=d")
+LARGE = [f"grid.{name}=[{','.join(map(str, range(1, 102)))}]" for name in ("sigma", "bin_size", "c")]
 SIGMA = "grid.sigma=[10]"
 PROGRAMS = {"evaluate": "evaluate", "sweep": "sweep", "learn": "learn", "map build": "map", "localize": "localize",
             "paper": "paper"}  # fmt: skip
@@ -64,6 +66,9 @@ def test_a_scorer_composes_with_the_values_of_its_fields():
     ("evaluate", ["confidence=/none.json"], "/none.json: expected the confidence.json"),
     ("evaluate", ["system=ssm_vpr", "features=sift"], "scorer=grid: expected features=ssm"),
     ("evaluate", ["system=ssm_vpr", "matching.cross_check=mutual"], "cross_check=mutual: expected candidate"),
+    ("evaluate", ["system=ssm_vpr", "features.image_size=[304,144]", "scorer.side=24"], "expected the [36, 16] cells"),
+    ("sweep", LARGE, "grid: expected at most 1,000,000 settings, got 1,030,301"),
+    ("evaluate", [*LABELS, "dataset.queries=[a,b]"], "ground_truth=label: expected one folder of queries"),
     ("evaluate", ["features=aliked", "features.image_size=null"], "features.image_size=null: expected a list of 2"),
     ("localize", ["map=a", "images=b", "route=-2000"], "route=-2000: expected a number from -1000 to 1000"),
     ("evaluate", ["scorer.histogram.weight=[]"], "scorer.histogram.weight=[]: expected "),

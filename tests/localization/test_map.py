@@ -155,16 +155,16 @@ def test_nothing_is_compiled_after_the_warm_up(dataset, folder, compilations):
 
 def test_unsure_answers_are_no_place(dataset, folder):
     image = dataset.queries.paths[0]
-    sure = opened(folder, confidence=SURE).localize(image)
+    sure = opened(folder, candidates=10, confidence=SURE).localize(image)
     assert 0.5 < sure.confidence <= 1
     assert sure.place is not None
     assert sure.reason is None
-    refused = opened(folder, confidence=replace(SURE, bias=-100.0), threshold=0.5).localize(image)
+    refused = opened(folder, candidates=10, confidence=replace(SURE, bias=-100.0), threshold=0.5).localize(image)
     assert refused.place is None
     assert refused.confidence < 1e-9
     assert (refused.reason, refused.shift, refused.shift_interval) == ("low confidence", None, None)
     assert refused.alternatives == sure.alternatives
-    assert opened(folder, confidence=SURE, threshold=sure.confidence).localize(image).place == sure.place
+    assert opened(folder, candidates=10, confidence=SURE, threshold=sure.confidence).localize(image).place == sure.place
 
 
 def test_images_come_one_by_one_and_others_see_them(dataset, tmp_path):

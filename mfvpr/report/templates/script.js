@@ -125,7 +125,7 @@ const drawn = charts.map(({ name, scale, axes, data }) => {
   const isBars = scale === "share";
   const bars = isBars ? data.reduce((sum, [, members]) => sum + members.length, 0) : 0;
   const layout = {
-    ...look, height: Math.max(380, 100 + 16 * bars), showlegend: data.length > 1,
+    ...look, height: Math.max(380, 100 + 16 * bars, 44 * data.length), showlegend: data.length > 1,
     xaxis: axis(axes[0], scales[scale]),
     yaxis: axis(axes[1], isBars ? { type: "category", autorange: "reversed" } : { range: [-2, 102] }),
   };

@@ -1,1 +1,1 @@
-"""Learning of match weights, projections and parameters of scorers from losses of a ranking, and its evaluation."""
+"""Learning of match weights and parameters of scorers from losses of a ranking, and its evaluation."""
