@@ -181,11 +181,9 @@ def confidence_from_json(values: Mapping[str, Any]) -> Confidence:
     vectors = {name: tuple(values[name]) for name in ("center", "scale", "weights", "refusals")}
     numbers = np.array([*vectors.values()], float).reshape(4, 2)  # two inputs, two shares
     _, scale, weights, shares = numbers
-    is_finite = np.isfinite([*numbers.flat, values["bias"]]).all()
-    if not (is_finite and min(*scale, *shares) > 0 and min(weights) >= 0 and max(shares) <= 1):
+    is_known = values.get("apart", APART) == APART and np.isfinite([*numbers.flat, values["bias"]]).all()
+    if not (is_known and min(*scale, *shares) > 0 and min(weights) >= 0 and max(shares) <= 1):
         raise ValueError("values that make no model")
-    if values.get("apart", APART) != APART:  # of an earlier version
-        raise ValueError(f"of rankings with apart={values['apart']}, not {APART}")
     return Confidence(bias=values["bias"], **vectors)
 
 
