@@ -229,9 +229,7 @@ def convert(
         raise InputError(f"{missing}: expected a path for --layout {layout} of {source}, got none")
     if not source.is_dir():
         if layout in _CANDIDATES:
-            raise InputError(
-                f"{source}: expected the run folder of mfvpr evaluate for --layout {layout}, got no folder"
-            )
+            raise InputError(f"{source}: expected the run folder of mfvpr evaluate for --layout {layout}, got none")
         names = image_folder(database).names if database else ()
         _write_localized(out, layout, run_files.read_lines(source), poses, names, times)
         return
