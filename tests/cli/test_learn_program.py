@@ -133,16 +133,15 @@ def test_the_papers_rows_are_an_evaluation(root, learn, untrained, tmp_path, cha
 
 
 def test_an_interrupted_learning_goes_on_to_the_same_end(root, learn, learned, tmp_path, monkeypatch):
-    saved, save = [], training.CacheFiles.update
+    saved, save = [], training.save_checkpoint
 
-    def interrupted(files, items):
-        states = [state for state in items.values() if isinstance(state, training.State)]
-        saved.extend((files.folder.name.rpartition("-")[0], state.step) for state in states)
-        if states and len(saved) == 4:
+    def interrupted(folder, state):
+        saved.append((folder.name.rpartition("-")[0], state.step))
+        if len(saved) == 4:
             raise KeyboardInterrupt
-        save(files, items)
+        save(folder, state)
 
-    monkeypatch.setattr(training.CacheFiles, "update", interrupted)
+    monkeypatch.setattr(training, "save_checkpoint", interrupted)
     again = (*SHORT, f"checkpoints={tmp_path}/kept")
     with pytest.raises(KeyboardInterrupt):
         learn(tmp_path / "out", *again)
