@@ -76,7 +76,8 @@ def _set_up_jax(compiled: bool) -> None:
         jax.devices()
     except (RuntimeError, AssertionError) as error:  # the latter for `cuda` without its plugin
         platforms, reason = os.environ.get("JAX_PLATFORMS"), " ".join(str(error).splitlines()[:1])
-        raise InputError(f"JAX_PLATFORMS={platforms}: expected a device that JAX can use, got: {reason}") from error
+        words = f"expected a device that JAX can use, such as JAX_PLATFORMS=cpu, got: {reason}"
+        raise InputError(f"JAX_PLATFORMS={platforms}: {words}") from error
 
 
 def checked(program: str, composed: DictConfig) -> Any:
@@ -166,7 +167,8 @@ def aliked_or_sift() -> str:
     """The features of system=steering: ALIKED if its weights are installed, otherwise SIFT, with a warning."""
     if is_installed(entry_of("aliked-n16")):
         return "aliked"
-    warnings.warn("system=steering uses SIFT, because the weights aliked-n16 are not installed", stacklevel=2)
+    remedy = "mfvpr weights download aliked-n16"
+    warnings.warn(f"system=steering uses SIFT, because ALIKED's weights are not installed; see: {remedy}", stacklevel=2)
     return "sift"
 
 

@@ -111,18 +111,18 @@ def fitting_confidences(
     scores, deciding = system.final_scores, system.headline
     if deciding not in fitted:
         got = ", ".join(fitted) or "none"
-        raise InputError(f"confidence={path}: expected one of {deciding}, which decides, got {got}")
-    made = {**(origin.get("settings") or {}), "candidates": origin.get("candidates")}
+        raise InputError(f"confidence={path}: expected the confidence of {deciding}, which decides, got {got}")
+    before = {**(origin.get("settings") or {}), "candidates": origin.get("candidates")}
     now = {**settings, "scorer": assembly.describe_settings(settings["scorer"])}
-    other = {}
+    differing = {}
     for name in (name for name in fitted if name in scores):
-        both = [_settings_of(scores[name].scorers, each) for each in (made, now)]
-        other[name] = [each for each in _NAMES if each in now and both[0].get(each) != both[1][each]]
+        both = [_settings_of(scores[name].scorers, each) for each in (before, now)]
+        differing[name] = [each for each in _NAMES if each in now and both[0].get(each) != both[1][each]]
     if not origin.get("absent_queries"):
         warn(f"confidence={path} was fitted without absent places, so that it is too high for them")
-    if words := ", ".join(other[deciding]):
+    if words := ", ".join(differing[deciding]):
         warn(f"confidence={path} was fitted with other settings of {words}: it may mean nothing here")
-    return {name: fitted[name] for name in other if {*other[name]} <= {*other[deciding]}}, origin
+    return {name: fitted[name] for name in differing if {*differing[name]} <= {*differing[deciding]}}, origin
 
 
 def _settings_of(names: Collection[str], settings: Mapping[str, Any]) -> dict[str, Any]:

@@ -220,8 +220,8 @@ def _warn_of_settings(settings: Common, dataset: Dataset, contents: Mapping[str,
             warn(f"weight={name} was learned on images of {dataset.name}, so that it flatters here")
         for group, key in (("features", "weights"), ("matching", "cross_check")):
             before, now = origin.get("settings", {}).get(group, {}), getattr(settings, group)
-            if other := [each for each in ("name", key) if before.get(each) != now.get(each)]:
-                words = ", ".join(f"{before.get(each, 'unknown')} instead of {now.get(each)}" for each in other)
+            if differing := [each for each in ("name", key) if before.get(each) != now.get(each)]:
+                words = ", ".join(f"{before.get(each, 'unknown')} instead of {now.get(each)}" for each in differing)
                 warn(f"weight={name} was learned with other {group} ({words}); it may mean nothing here")
 
 

@@ -71,8 +71,8 @@ def localize(settings: Localize) -> None:
     if settings.confidence is not None:
         from mfvpr.cli.evaluation import fitting_confidences  # here: it imports the reports
 
-        made = read_settings(folder)
-        used = without(made, "fusion") if made["final"] == "score" else made
+        of_map = read_settings(folder)
+        used = without(of_map, "fusion") if of_map["final"] == "score" else of_map
         confidence = fitting_confidences(settings.confidence, system, used)[0][system.headline]
     robot_map = Map(folder, system, confidence=confidence, threshold=settings.threshold, runtime=runtime)
     drive = _Drive(robot_map, settings)

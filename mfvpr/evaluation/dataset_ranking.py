@@ -78,7 +78,7 @@ class RankedDataset:
         positives = []
         for sequence in self.dataset.sequences:
             if sequence.truth is None:
-                raise InputError(f"{self.dataset.name}: there is no ground truth, so rankings only")
+                raise InputError(f"{self.dataset.name}: expected a data set with ground truth, got rankings only")
             truth = sequence.truth.positives(threshold)
             expected, got = (len(sequence.images), len(self.dataset.database)), (len(truth), truth.num_database)
             if got != expected:

@@ -169,7 +169,7 @@ class System:
         by_name = {score.name: score for score in scores}
         for score in scores:
             if by_name[score.name] is not score:
-                raise InputError(f"scorers: {score.name} is the name of another system; choose another one")
+                raise InputError(f"scorers: expected every name once, got {score.name} twice; choose another one")
         return by_name
 
     @property

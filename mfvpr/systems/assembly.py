@@ -119,8 +119,8 @@ def choices_of(group: str) -> dict[str, dict[str, Any]]:
     """Settings of a group by choice and name. `name` in a group's settings, or `method` of a scorer, is the choice."""
     known, files = dict[str, dict[str, Any]](), settings_of(_Files)
     for name, (owner, weights) in NETWORKS.get(group, {}).items():
-        own = without(settings_of(getattr(features, owner)), "whitening")
-        known[name] = {"weights": Setting(weights, TEXT, _LIST), **own}
+        of_owner = without(settings_of(getattr(features, owner)), "whitening")
+        known[name] = {"weights": Setting(weights, TEXT, _LIST), **of_owner}
     if "ssm" in known:
         known["ssm"] |= settings_of(WindowFitting)
     if group == "features":
@@ -339,12 +339,12 @@ def pipeline(settings: SystemSettings, data: Dataset | None) -> Pipeline:
     with in_group("features", settings.features):
         local = extractor(settings.features, data)
     with in_group("retrieval", settings.retrieval):
-        finder = retriever(settings.retrieval, local, data)
+        search = retriever(settings.retrieval, local, data)
     with in_group("matching", settings.matching):
         match = matcher(settings.matching, data)
     size = settings.features["image_size"]
     pixels = math.prod(local.image_size or ()) if size == "auto" else size if isinstance(size, int) else None
-    return Pipeline(local, finder, match, settings.candidates, pixels)
+    return Pipeline(local, search, match, settings.candidates, pixels)
 
 
 def system(settings: SystemSettings) -> System:

@@ -365,5 +365,5 @@ class HalfComparison:
             label = f"{split.name}-{name}".replace(" ", "_").replace("_+_", "_")
             checkpoints = Checkpoints(checkpoints.folder, recipe, label)
         schedule = Schedule(optax.adam(options.learning_rate), options.steps, options.every, options.patience)
-        keeping = {"checkpoints": checkpoints, "track": self.runtime.progress(f"{split.name}: {name}")}
-        return fit(model.start, objective, batches, schedule, validate=validate, **keeping)
+        track = self.runtime.progress(f"{split.name}: {name}")
+        return fit(model.start, objective, batches, schedule, validate=validate, checkpoints=checkpoints, track=track)
