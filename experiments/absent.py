@@ -17,8 +17,8 @@ from jaxtyping import Bool, Float
 from experiments.drives import datasets_of, main
 from mfvpr.cli.command_line import load_system
 from mfvpr.evaluation import Confidence, confidence_inputs, fit_confidence, rank_dataset
+from mfvpr.evaluation.calibration import fit_on_drive
 from mfvpr.evaluation.confidence import reliability
-from mfvpr.localization.map_settings import fit_on_drive
 from mfvpr.report import Table
 from mfvpr.storage import FeatureCache
 

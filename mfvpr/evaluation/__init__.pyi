@@ -34,9 +34,9 @@ __all__ = [
     "write_confidences",
 ]
 
+from .calibration import calibration_data
 from .confidence import (
     Confidence,
-    calibration_data,
     confidence_inputs,
     fit_confidence,
     precision_recall,

@@ -14,14 +14,12 @@ import numpy as np
 import scipy  # its subpackages are imported at their first use
 from jaxtyping import Bool, Float, Int
 
-from mfvpr.datasets.ground_truth import Truth
 from mfvpr.evaluation.rankings import Ranked
 from mfvpr.utils.errors import InputError
 from mfvpr.utils.files import require_file, require_replaceable, write_text
 
 APART = 5  # rows of the database
 REFUSALS = 0.2, 0.5  # shares of images without enough evidence, by default
-AROUND = 5  # times the distance of a correct prediction: nearer images show the place, or are not known to be elsewhere
 _LEAST_WEIGHT = 1e-9  # of an input: smaller ones are rounding errors, which would order equal predictions
 _FORMAT = "mfvpr confidence 3"
 _LEAST_SPREAD = 1e-3  # of the first score: less is rounding
@@ -108,51 +106,6 @@ def fit_confidence(values: Float[np.ndarray, "queries inputs"], correct: Bool[np
     fit = scipy.optimize.minimize(loss, 0 * penalty, jac=True, method="L-BFGS-B", bounds=bounds, options=options)
     bias, *weights = np.where(np.abs(fit.x) > _LEAST_WEIGHT, fit.x, 0.0).tolist()
     return Confidence(tuple(center.tolist()), tuple(scale.tolist()), tuple(weights), bias)
-
-
-class CalibrationData(NamedTuple):
-    """Inputs of a confidence of Q queries, for places that the database shows and for absent places."""
-
-    present: Float[np.ndarray, "queries inputs"]  # of the queries as they are, see `confidence_inputs`
-    absent: Float[np.ndarray, "queries inputs"]  # without the images of their place; NaN if no candidate is left
-    correct: Bool[np.ndarray, " queries"]  # top predictions of the queries as they are
-
-    @property
-    def num_absent(self) -> int:
-        """Number of queries that count once more, as images of an absent place."""
-        return int(np.isfinite(self.absent).all(axis=1).sum())
-
-    def take(self, queries: Int[np.ndarray, " _"]) -> "CalibrationData":
-        """The data of some queries."""
-        return CalibrationData(*(values[queries] for values in self))
-
-    def fit(self) -> Confidence:
-        """Fit a confidence on present and absent places; an `InputError` if no query has usable inputs."""
-        correct = np.append(self.correct, np.zeros(len(self.absent), bool))
-        return fit_confidence(np.concatenate([self.present, self.absent]), correct)
-
-
-def calibration_data(ranked: Ranked, truth: Truth, threshold: float) -> CalibrationData:
-    """Count each query as it is, and once more as an image of an absent place, see `absent_ranking`.
-
-    confidence = calibration_data(ranked, truth, 2).fit()  # correct within 2 frames
-    """
-    absent = confidence_inputs(absent_ranking(ranked, truth, threshold))
-    correct = truth.positives(threshold).contains(ranked.rows)[:, 0]
-    return CalibrationData(confidence_inputs(ranked), absent, correct)
-
-
-def absent_ranking(ranked: Ranked, truth: Truth, threshold: float) -> Ranked:
-    """The ranking without the images of each query's place, as if the database did not show it.
-
-    Images within five times the threshold are left out, and the other candidates keep their scores. A query without
-    images to leave out has no candidates: it shows an absent place as it is.
-    """
-    place = truth.shows_place(AROUND * max(threshold, 1))
-    is_left_out = place.contains(ranked.rows) | (place.counts == 0)[:, None]
-    order = np.argsort(is_left_out, axis=1, kind="stable")
-    values = np.where(is_left_out, -1, ranked.rows), np.where(is_left_out, np.nan, ranked.scores)
-    return Ranked(*(np.take_along_axis(each, order, axis=1) for each in values))
 
 
 def write_confidences(path: Path | str, systems: Mapping[str, Confidence], recipe: Mapping[str, Any]) -> None:

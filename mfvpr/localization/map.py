@@ -20,6 +20,7 @@ from jaxtyping import Bool
 from mfvpr.core.types import Features, Shortlist
 from mfvpr.datasets.datasets import GroundTruth, ImageFolder, image_folder
 from mfvpr.datasets.datasets import folder as folder_dataset
+from mfvpr.evaluation.calibration import fit_on_drive
 from mfvpr.evaluation.confidence import REFUSALS, Confidence, confidence_from_json
 from mfvpr.evaluation.dataset_ranking import Reason
 from mfvpr.evaluation.evidence import LEAST_STRENGTH, evidence_scores, reason_against, reason_against_image
@@ -156,7 +157,7 @@ class Map:
         `ground_truth`, see `mfvpr.datasets.folder`. The cache keeps features.
         """
         dataset = folder_dataset(database, queries, ground_truth=ground_truth)
-        self.confidence, data = map_settings.fit_on_drive(dataset, self.system, cache)
+        self.confidence, data = fit_on_drive(dataset, self.system, cache)
         if (of_system := map_settings.system_fingerprint(self.system)) is None:
             warnings.warn("a part of the system names no `recipe`: the confidence is not kept on disk", stacklevel=2)
         else:

@@ -1,24 +1,15 @@
-"""What a map keeps beside its images: settings of its system, and the confidence that a drive gives."""
+"""What a map keeps of its system: settings, recipes, the size of images."""
 
 import json
-import warnings
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
-from mfvpr.datasets.datasets import Dataset, ImageFolder
-from mfvpr.datasets.ground_truth import middle
-from mfvpr.evaluation.confidence import REFUSALS, CalibrationData, Confidence, absent_ranking, calibration_data
-from mfvpr.evaluation.dataset_ranking import rank_dataset
-from mfvpr.evaluation.evidence import evidence_against
+from mfvpr.datasets.datasets import ImageFolder
 from mfvpr.evaluation.system import Note, System
 from mfvpr.features.extractor import Extractor
 from mfvpr.features.vlad import VladFitting
 from mfvpr.matchers.host_matcher import PairSource
 from mfvpr.retrieval.search import ExactSearch
-from mfvpr.storage.feature_cache import FeatureCache
 from mfvpr.storage.maps import MapFile
 from mfvpr.systems import assembly
 from mfvpr.systems.assembly import SystemSettings
@@ -28,8 +19,6 @@ from mfvpr.utils.fingerprints import fingerprint, recipe_of
 
 _KEPT = ("features", "retrieval", "matching", "scorer", "candidates", "fusion", "final", "ties")  # settings
 _ABOUT = 1.5  # relative difference of numbers of pixels: sides are rounded
-_USUAL = 10  # images with the shares of `REFUSALS`, that are added to those of a drive
-_LEAST_RANGE = 0.02  # of the confidence over a drive that tells correct from incorrect predictions
 
 
 def describers_of(system: System) -> tuple[Extractor, Extractor | VladFitting]:
@@ -104,39 +93,6 @@ def fit_to_map(folder: Path, system: System, images: ImageFolder | None, note: N
         fix = "Use `Map.create`, or a system with features.image_size=[WIDTH,HEIGHT]"
         raise InputError(f"image_size: expected the images of a new map, whose shape decides, got none. {fix}.")
     return system.fit_image_size([images], note)
-
-
-def fit_on_drive(dataset: Dataset, system: System, cache: FeatureCache | None) -> tuple[Confidence, CalibrationData]:
-    """Fit the confidence of the ranking that decides on a data set; also what it was fitted on.
-
-    Each query counts twice: as it is, and without the images of its place, see `calibration_data`.
-    """
-    truth, root, cache = dataset.only.truth, dataset.queries.root, cache or FeatureCache()
-    if truth is None:
-        raise InputError(f"{dataset.name}: expected a ground truth, which says what is correct, got none")
-    result, threshold = rank_dataset(dataset, system, cache=cache), middle(truth.thresholds())
-    [ranked] = result.systems[system.headline]
-    absent = absent_ranking(ranked, truth, threshold)
-    refused = []  # of the queries as they are, and without the images of their place
-    for rankings in (ranked, absent):
-        [reasons] = evidence_against(replace(result, systems={system.headline: [rankings]}), cache)
-        refused.append(np.array([reason is not None for reason in reasons]))
-    shown, has_absent = truth.positives(threshold).counts > 0, absent.rows[:, 0] >= 0
-    on, off = refused[0][shown], np.concatenate([refused[0][~shown], refused[1][has_absent]])
-    usual_on, usual_off = _USUAL * np.array(REFUSALS)
-    refusals = (on.sum() + usual_on) / (len(on) + _USUAL), (off.sum() + usual_off) / (len(off) + _USUAL)
-    data = calibration_data(ranked, truth, threshold)
-    confidence = replace(data.fit(), refusals=(float(refusals[0]), float(refusals[1])))
-    probabilities, reasons = confidence.probability(data.present), list[str]()
-    if not data.num_absent:
-        reason = "without the images of a query's place there are no candidates, so that places that the map does not"
-        reasons.append(f"{reason} show get too high a confidence")
-    if np.ptp(probabilities[np.isfinite(probabilities)]) < _LEAST_RANGE:
-        reason = f"scores do not tell correct predictions ({data.correct.sum()} of {len(data.correct)}) from incorrect"
-        reasons.append(f"{reason} ones, so that every image gets the same confidence")
-    for reason in reasons:
-        warnings.warn(f"{root}: {reason}; calibrate on a longer drive", stacklevel=3)
-    return confidence, data
 
 
 def system_fingerprint(system: System) -> str | None:

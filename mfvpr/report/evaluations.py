@@ -15,7 +15,8 @@ from mfvpr.datasets.datasets import MEANS, QuerySequence
 from mfvpr.datasets.ground_truth import Truth, Unit, middle, threshold_words
 from mfvpr.datasets.positives import Positives, stack_positives
 from mfvpr.evaluation import confidence
-from mfvpr.evaluation.confidence import CalibrationData, Confidence, PrecisionRecall
+from mfvpr.evaluation.calibration import CalibrationData, absent_ranking, calibration_data
+from mfvpr.evaluation.confidence import Confidence, PrecisionRecall
 from mfvpr.evaluation.dataset_ranking import KS, RankedDataset, Reason
 from mfvpr.evaluation.protocol import Half, halves, halves_of_map
 from mfvpr.evaluation.rankings import Ranked
@@ -145,7 +146,7 @@ class EvaluationReport:
                 present[:] = self.confidences[name](self.rankings[name])
                 parts = self.parts, self.ranked.systems[name], self._truths
                 for part, ranked, truth in zip(*parts, strict=True) if self.thresholds else ():
-                    absent[part] = self.confidences[name](confidence.absent_ranking(ranked, truth, self.threshold))
+                    absent[part] = self.confidences[name](absent_ranking(ranked, truth, self.threshold))
                 continue
             for half in self.path_halves():
                 tune, report = self.calibration[name].take(half.tune), self.calibration[name].take(half.report)
@@ -161,7 +162,7 @@ class EvaluationReport:
         calibration = {}
         for name, rankings in self.ranked.systems.items() if self.thresholds else ():
             pairs = zip(rankings, self._truths, strict=True)
-            parts = [confidence.calibration_data(ranked, truth, self.threshold) for ranked, truth in pairs]
+            parts = [calibration_data(ranked, truth, self.threshold) for ranked, truth in pairs]
             calibration[name] = CalibrationData(*map(np.concatenate, zip(*parts, strict=True)))
         return calibration
 

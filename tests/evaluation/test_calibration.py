@@ -21,7 +21,8 @@ from mfvpr.evaluation import (
     reliability,
     write_confidences,
 )
-from mfvpr.evaluation.confidence import absent_ranking, chance_calibration_error
+from mfvpr.evaluation.calibration import absent_ranking
+from mfvpr.evaluation.confidence import chance_calibration_error
 from mfvpr.report.evaluations import EvaluationReport
 from mfvpr.utils import InputError
 
