@@ -61,6 +61,7 @@ _LICENSES = {  # network -> of the code and of the weights
     "gem": ("MIT", "MIT"),
     "dinov2": ("Apache-2.0", "Apache-2.0"),
     "selavpr": ("MIT, Apache-2.0", "none stated"),
+    "efficientnet": ("Apache-2.0", "Apache-2.0"),
 }
 
 
@@ -151,6 +152,11 @@ for _name, _clusters, _outputs, _size, _sha256 in (
 for _name, *_sizes in (("vits14", 384, 12, 6), ("vitb14", 768, 12, 12), ("vitl14", 1024, 24, 16)):
     _source = f"https://dl.fbaipublicfiles.com/dinov2/dinov2_{_name}/dinov2_{_name}_pretrain.pth"
     _publish("dinov2", f"dinov2_{_name}", _source, conversion.DINOV2, "VisionTransformer", *_sizes)
+
+_source = "https://github.com/RangiLyu/EfficientNet-Lite/releases/download/v1.0/efficientnet_lite0.pth"
+_sha256 = "579344248a93e23026e6b78f1f6faf0bc1d282386f6c881cdbaacd49cabf77db"
+_about = {"file": "efficientnet-lite0-57934424.pth", "size": 18_826_032, "sha256": _sha256}
+_publish("efficientnet", "efficientnet_lite0", _source, conversion.EFFICIENTNET, "EfficientNetLite0", **_about)
 
 for _name, _id, _file, _registers in (
     ("selavpr_pitts30k", "1LKTZZRHfMH3dY3UPagCt2TIlMN5LguGO", "SelaVPR_pitts30k.pth", 0),

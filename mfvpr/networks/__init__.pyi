@@ -1,6 +1,7 @@
 __all__ = [
     "Aliked",
     "D2Net",
+    "EfficientNetLite0",
     "Gem",
     "LightGlue",
     "MixVPR",
@@ -16,6 +17,7 @@ __all__ = [
 from .aliked import Aliked
 from .backbones import ResNet50, SsmVgg, Vgg16
 from .d2net import D2Net
+from .efficientnet import EfficientNetLite0
 from .global_descriptors import Gem, MixVPR, NetVlad, VggNetVlad
 from .lightglue import LightGlue
 from .vit import SelaVpr, VisionTransformer
