@@ -1,7 +1,9 @@
 """Settings and systems by their names: Hydra composes `conf/` and overrides, a dataclass checks, a job gets them."""
 
+import itertools
 import json
 import os
+import re
 import shlex
 import sys
 import warnings
@@ -39,6 +41,7 @@ def run(program: str, find_job: Callable[[], Job]) -> None:
     os.environ["HYDRA_FULL_ERROR"] = "1"  # Hydra then raises its errors
     warnings.filterwarnings("ignore", "A worker stopped")  # joblib renews a worker that has grown
     schema.register()
+    sys.argv[2:] = itertools.chain.from_iterable(map(alternate, sys.argv[2:]))
 
     def task(composed: DictConfig) -> None:
         about, typed, multirun = HydraConfig.get(), sys.argv[1:], None
@@ -62,6 +65,12 @@ def run(program: str, find_job: Callable[[], Job]) -> None:
                 job(replace(settings, command=f"mfvpr {program} {shown}", multirun=multirun, workers=workers))
 
     hydra.main(version_base="1.3", config_path=str(CONF), config_name=program)(task)()
+
+
+def alternate(override: str) -> list[str]:
+    """`retrieval=[A,B]` in the words of Hydra, in which a list of choices is merged; others as they are."""
+    names = re.fullmatch(r"retrieval=\[ *(\w+), *(\w+) *\]", override)
+    return ["~retrieval", *(f"+retrieval@retrieval.{name}={name}" for name in names.groups())] if names else [override]
 
 
 def _set_up_jax(compiled: bool) -> None:
@@ -148,7 +157,11 @@ def override(name: str, value: Any) -> str:
 def _overrides(settings: Mapping[str, Any], prefix: str = "") -> Iterator[str]:
     """Settings in Hydra's grammar."""
     for name, value in settings.items():
-        if f"{prefix}{name}" == "fusion.weights" and isinstance(value, Mapping):  # any names, but no group of settings
+        if f"{prefix}{name}" == "retrieval" and isinstance(value, list | tuple):
+            yield from alternate(f"retrieval=[{','.join(value)}]")
+        elif f"{prefix}{name}" == "fusion.weights" and isinstance(
+            value, Mapping
+        ):  # any names, but no group of settings
             yield f"fusion.weights={{{','.join(f'{scorer}:{weight}' for scorer, weight in value.items())}}}"
         elif isinstance(value, Mapping):
             yield from _overrides(value, f"{prefix}{name}.")

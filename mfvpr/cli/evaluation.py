@@ -4,13 +4,16 @@ from collections.abc import Collection, Mapping
 from dataclasses import dataclass, replace
 from typing import Any
 
+import numpy as np
+
 from mfvpr.cli import jobs
 from mfvpr.cli.console import warn
 from mfvpr.cli.jobs import Inputs, prepare, truth_in_words
 from mfvpr.cli.schema import Evaluate
+from mfvpr.core.metrics import hits
 from mfvpr.datasets import Dataset
 from mfvpr.datasets.contents import fingerprints
-from mfvpr.datasets.ground_truth import middle
+from mfvpr.datasets.ground_truth import middle, threshold_words
 from mfvpr.evaluation import Confidence, System, rank_dataset, read_confidences
 from mfvpr.evaluation.dataset_ranking import num_candidates
 from mfvpr.evaluation.evidence import evidence_against
@@ -19,6 +22,7 @@ from mfvpr.report.figures import query_figures
 from mfvpr.report.pages import write_report
 from mfvpr.report.run_files import RunDescription, ground_truth, heading, write_run_folder
 from mfvpr.report.runs import Figure
+from mfvpr.retrieval.retriever import standardizations, with_standardization
 from mfvpr.systems import assembly
 from mfvpr.utils import Stopwatch
 from mfvpr.utils.errors import InputError
@@ -82,9 +86,24 @@ def evaluation_of(settings: Evaluate) -> Outcome:
     lacking = None if settings.threshold is None else evidence_against(ranked, inputs.cache)
     report = EvaluationReport(ranked, inputs.thresholds, settings.recall.ks, confidences, settings.threshold, lacking)
     described = {name: values[name] for name in _NAMES} | {"scorer": assembly.describe_settings(settings.scorer)}
-    truth = inputs.ground_truth
-    description = RunDescription(truth, truth_in_words(truth), inputs.contents, described, settings.command)
+    truth, remark = inputs.ground_truth, running_in_words(report, inputs)
+    of_run = truth, truth_in_words(truth), inputs.contents, described, settings.command
+    description = RunDescription(*of_run, remark=remark)
     return Outcome(inputs, report, description, query_figures(report, figure_queries))
+
+
+def running_in_words(report: EvaluationReport, inputs: Inputs[Evaluate]) -> str:
+    """Recall of the retrieval without later queries, where its standardization looks at all of a drive."""
+    dataset, retriever = report.ranked.dataset, inputs.pipeline.retriever
+    if not report.thresholds or all("drive" not in standardizations(retriever, each) for each in dataset.sequences):
+        return ""
+    running, correct = with_standardization(retriever, "running"), list[np.ndarray]()
+    for sequence, positives in zip(dataset.sequences, report.ranked.positives(report.threshold), strict=True):
+        shortlist = running.shortlist(sequence, dataset.database, 1, inputs.cache).candidates
+        correct.append(hits(shortlist.indices, positives))
+    recall = 100 * np.concatenate(correct).mean()
+    within = threshold_words(inputs.ground_truth["unit"], report.threshold)
+    return f"; retrieval with the queries so far alone (running): R@1{within} {recall:.1f}"
 
 
 def query_rows(queries: int | list[int | str], dataset: Dataset) -> int | list[int]:

@@ -23,7 +23,7 @@ from mfvpr.evaluation.rankings import Matched, Ranked, rank_by_scores
 from mfvpr.evaluation.system import Pipeline, System, folders_of
 from mfvpr.matchers.host_matcher import Side
 from mfvpr.matchers.match_set import MatchSet
-from mfvpr.retrieval.retriever import RetrievalResult, fit_to_database
+from mfvpr.retrieval.retriever import RetrievalResult, fit_to_database, fit_to_sequence
 from mfvpr.storage.cache_files import MatchStore
 from mfvpr.storage.feature_cache import FeatureCache
 from mfvpr.utils.compiled_programs import keep_compiled_programs
@@ -161,7 +161,7 @@ def match_sequence(
         with watch("features"):
             pipeline = replace(pipeline, extractor=fit_to_database(pipeline.extractor, database, cache))
     with watch("retrieval"):
-        retriever = fit_to_database(pipeline.retriever, database, cache)
+        retriever = fit_to_sequence(fit_to_database(pipeline.retriever, database, cache), sequence)
         pipeline = replace(pipeline, retriever=retriever)
     number = num_candidates(pipeline.candidates, database)
     recipe, stores = cache.recipe(lambda: matches_recipe(dataset, sequence, pipeline, cache)), list[MatchStore]()
@@ -215,7 +215,7 @@ def matches_recipe(
     return {
         "database": cache.recipes.of_folder(database, extractor),
         "query": cache.recipes.of_folder(sequence.images, extractor),
-        "filter": cache.recipes.of(fit_to_database(pipeline.retriever, database, cache)),
+        "filter": cache.recipes.of(fit_to_sequence(fit_to_database(pipeline.retriever, database, cache), sequence)),
         "candidates": num_candidates(pipeline.candidates, database),
         "matching": cache.recipes.of(pipeline.matcher),
         "skip_bad": cache.skip_bad,

@@ -4,6 +4,7 @@ __all__ = [
     "D2NetFeatures",
     "Description",
     "Dinov2Features",
+    "EfficientNetDescriptor",
     "Extractor",
     "FeatureSet",
     "FeatureSource",
@@ -24,7 +25,7 @@ __all__ = [
 
 from .extractor import Aggregated, Description, Extractor, Scale, Source
 from .feature_set import FeatureSet, FeatureSource, InMemory
-from .network import AlikedFeatures, D2NetFeatures, GlobalDescriptor, MixVprDescriptor
+from .network import AlikedFeatures, D2NetFeatures, EfficientNetDescriptor, GlobalDescriptor, MixVprDescriptor
 from .patch_networks import Dinov2Features, PatchNetVladFeatures, SelaVprFeatures
 from .sift import Sift
 from .ssm_features import SsmCells, SsmWindows

@@ -158,6 +158,16 @@ def _combine(matrix: Sequence[Sequence[float]], parts: Sequence[Array]) -> list[
     return [sum(terms[1:], start=terms[0]) for terms in products]
 
 
+def average_cells(maps: Float[Array, "..."], cells: int, axis: int) -> Float[Array, "..."]:
+    """Means of an axis over cells of about equal size; cells share a position that lies in both."""
+    size, cell = maps.shape[axis], np.arange(cells)
+    start, end = cell * size // cells, -(-(cell + 1) * size // cells)
+    position = np.arange(size)
+    inside = (position[None] >= start[:, None]) & (position[None] < end[:, None])
+    weights = jnp.asarray(inside / (end - start)[:, None], maps.dtype)
+    return jnp.moveaxis(jnp.tensordot(weights, maps, (1, axis), precision=PRECISION), 0, axis)
+
+
 class GeneralizedMean(nnx.Module):
     """(mean_p max(x_p, 1e-6)^power)^(1 / power) of each channel: power 1 is the mean, infinity the maximum."""
 

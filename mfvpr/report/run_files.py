@@ -27,6 +27,7 @@ from mfvpr.io.shortlists import write_shortlist
 from mfvpr.io.trajectories import SECOND, read_poses, write_trajectory
 from mfvpr.report.evaluations import NO_PLACE, EvaluationReport, confidence_table, recall_table
 from mfvpr.report.runs import file_names, read_csv, write_about, write_csv, write_json, write_table, writing
+from mfvpr.retrieval.retriever import standardizations
 from mfvpr.storage.feature_cache import FeatureCache
 from mfvpr.utils.errors import InputError
 from mfvpr.utils.files import require_replaceable
@@ -46,6 +47,7 @@ class RunDescription:
 
     truth: Mapping[str, Any]  # kind, files, unit and thresholds of the ground truth
     truth_words: str  # the same in headings
+    remark: str = field(default="", kw_only=True)  # behind the heading
     contents: Mapping[str, Contents]  # of the image files, by side
     settings: Mapping[str, Any]  # "retrieval", "features", "matching", "scorer", and others that scores depend on
     command: str | None = None
@@ -70,12 +72,16 @@ def heading(report: EvaluationReport, description: RunDescription) -> str:
     """Data set, numbers of images, retrieval, features and ground truth in one line."""
     dataset, settings = report.ranked.dataset, description.settings
     candidates = num_candidates(report.ranked.system.pipeline.candidates, dataset.database)
+    retrieval = settings["retrieval"].get("name") or " and ".join(settings["retrieval"])
+    rules = {
+        rule for each in dataset.sequences for rule in standardizations(report.ranked.system.pipeline.retriever, each)
+    }
     several = f" in {len(dataset.sequences)} sequences" if len(dataset.sequences) > 1 else ""
     incomplete = " (incomplete)" if any(published_differences(dataset)) else ""
     return (
         f"{dataset.name}{incomplete}: {len(report.queries)} queries{several}, {len(dataset.database)} database images, "
-        f"{candidates} candidates ({settings['retrieval']['name']}), {matched_content(settings)}; "
-        f"{description.truth_words}"
+        f"{candidates} candidates ({', standardized by '.join([retrieval, *sorted(rules)])}), {matched_content(settings)}; "
+        f"{description.truth_words}{description.remark}"
     )
 
 

@@ -1,4 +1,5 @@
 __all__ = [
+    "Alternating",
     "DescriptorFiles",
     "ExactSearch",
     "FeatureFiles",
@@ -8,11 +9,13 @@ __all__ = [
     "Retriever",
     "ShortlistFiles",
     "SsmVoting",
+    "StandardizedSearch",
     "WhitenedSearch",
     "fit_to_database",
     "retrieve",
 ]
 
 from .precomputed import DescriptorFiles, FeatureFiles, MatchFiles, ShortlistFiles
-from .retriever import Retrieval, RetrievalResult, Retriever, SsmVoting, fit_to_database
+from .retriever import Alternating, Retrieval, RetrievalResult, Retriever, SsmVoting, fit_to_database
 from .search import ExactSearch, WhitenedSearch, retrieve
+from .standardization import StandardizedSearch

@@ -20,7 +20,8 @@ from mfvpr.io.matches import Images, ImportedMatches, open_matches
 from mfvpr.io.pair_files import content_paths
 from mfvpr.io.shortlists import Entries, read_shortlist
 from mfvpr.retrieval.retriever import RetrievalResult
-from mfvpr.retrieval.search import EXACT, Search
+from mfvpr.retrieval.search import EXACT
+from mfvpr.retrieval.standardization import Search
 from mfvpr.storage.feature_cache import FeatureCache
 from mfvpr.utils.errors import InputError
 

@@ -12,7 +12,8 @@ from mfvpr.datasets.datasets import ImageFolder, QuerySequence
 from mfvpr.datasets.positives import Positives
 from mfvpr.features.extractor import Aggregated, Extractor, describe_folder
 from mfvpr.features.whitening import Whitening, WindowFitting, origin
-from mfvpr.retrieval.search import EXACT, Search
+from mfvpr.retrieval.search import EXACT
+from mfvpr.retrieval.standardization import Rule, Search, StandardizedSearch
 from mfvpr.storage.cache_files import CacheFiles
 from mfvpr.storage.feature_cache import FeatureCache
 
@@ -59,6 +60,36 @@ class Retrieval:
         queries = np.where(is_zero, np.nan, query_vectors.values)
         candidates = search.shortlist(queries, database_vectors.values, num_candidates, excluded=sequence.excluded)
         return RetrievalResult(candidates, query_vectors.bad, database_vectors.bad)
+
+
+@dataclass(frozen=True)
+class Alternating:
+    """Candidates of two retrievals in turns: the first of one, the first of the other, the second of one, ...
+
+    Each image is a candidate once. Scores fall in equal steps from 1 to 1 / C, since those of the two retrievals cannot
+    be compared.
+    """
+
+    first: Retriever
+    second: Retriever
+
+    def shortlist(
+        self, sequence: QuerySequence, database: ImageFolder, num_candidates: int, cache: FeatureCache
+    ) -> RetrievalResult:
+        """See `Retriever`."""
+        first, second = (
+            each.shortlist(sequence, database, num_candidates, cache) for each in (self.first, self.second)
+        )
+        both = np.stack([first.candidates.indices, second.candidates.indices], axis=2).reshape(len(sequence.images), -1)
+        indices = np.full(first.candidates.indices.shape, -1, np.int32)
+        for query, candidates in enumerate(both.tolist()):
+            once = [each for each in dict.fromkeys(candidates) if each >= 0][:num_candidates]
+            indices[query, : len(once)] = once
+        scores = 1 - np.arange(num_candidates, dtype=np.float32) / num_candidates
+        shortlist = Shortlist(indices, np.where(indices >= 0, scores[None], 0), indices >= 0)
+        bad_queries = {row: reason for row, reason in first.bad_queries.items() if row in second.bad_queries}
+        bad_database = {row: reason for row, reason in first.bad_database.items() if row in second.bad_database}
+        return RetrievalResult(shortlist, bad_queries, bad_database)
 
 
 @dataclass(frozen=True)
@@ -134,6 +165,28 @@ def fit_to_database(tool: Tool, database: ImageFolder, cache: FeatureCache) -> T
         whitening = cache.recipes.once("whitening", lambda: _whitening(tool, fitting, database, cache), database, tool)
         return replace(tool, whitening=whitening)  # pyright: ignore[reportArgumentType, reportCallIssue, reportReturnType]
     return with_parts(tool, lambda part: fit_to_database(part, database, cache))
+
+
+def fit_to_sequence(tool: Any, sequence: QuerySequence) -> Any:
+    """The retrieval with the rule of standardization that `auto` stands for with this sequence."""
+    if isinstance(tool, StandardizedSearch):
+        return tool.of(sequence)
+    return with_parts(tool, lambda part: fit_to_sequence(part, sequence))
+
+
+def with_standardization(tool: Any, rule: Rule) -> Any:
+    """The retrieval with another rule of standardization where it has one."""
+    if isinstance(tool, StandardizedSearch):
+        return StandardizedSearch(rule)
+    return with_parts(tool, lambda part: with_standardization(part, rule))
+
+
+def standardizations(tool: Any, sequence: QuerySequence) -> set[str]:
+    """The rules by which a retrieval, or its parts, standardize descriptors for this sequence."""
+    if isinstance(tool, StandardizedSearch):
+        return {tool.of(sequence).standardize}
+    parts = [getattr(tool, part.name) for part in fields(tool)] if is_dataclass(tool) else []
+    return {rule for part in parts for rule in standardizations(part, sequence)}
 
 
 def with_parts(whole: Any, change: Callable[[Any], Any]) -> Any:

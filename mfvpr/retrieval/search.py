@@ -99,9 +99,6 @@ class WhitenedSearch:
         return EXACT.shortlist(queries, database, num_candidates, excluded=excluded)
 
 
-Search = ExactSearch | WhitenedSearch
-
-
 @compiled
 def _project(
     descriptors: Float[Array, "images _"], mean: Float[Array, " _"], components: Float[Array, "dimensions _"]

@@ -27,6 +27,7 @@ from mfvpr.io.features import Lengths
 from mfvpr.matchers import LightGlueMatcher, Matcher, NearestNeighborMatcher
 from mfvpr.retrieval.precomputed import File
 from mfvpr.retrieval.search import EXACT
+from mfvpr.retrieval.standardization import Rule as Standardization
 from mfvpr.utils import recipe_of
 from mfvpr.utils.errors import InputError
 from mfvpr.utils.fields import (
@@ -76,9 +77,11 @@ NETWORKS = {  # class of mfvpr.features, which Flax makes slow to import, and we
         "gem": ("GlobalDescriptor", "cosplace_resnet50_2048"),
         "dinov2": ("GlobalDescriptor", "dinov2_vitl14"),
         "ssm": ("SsmWindows", "vgg16_places365"),
+        "efficientnet": ("EfficientNetDescriptor", "efficientnet_lite0"),
     },
 }
 _WHITEN = "principal components that are kept, each of unit variance, fitted on the database; null = as they are"
+_STANDARDIZE = "descriptors minus the mean, over the deviation, of: all queries (drive), those so far (running)"
 _WEIGHTS = "weights above 0 by name, such as {retrieval: 0.5, anchor: 1}"
 _LIST = "`mfvpr weights list` has all weights"
 _SHAPED = SIZE | whole(10_000, 4096**2) | "auto"  # a number of pixels; fewer than 10,000 are a side that was meant
@@ -138,6 +141,8 @@ def choices_of(group: str) -> dict[str, dict[str, Any]]:
         }
         for name in known.keys() - {"ssm"}:
             known[name]["whiten"] = Setting(None, whole(1, 4096) | None, _WHITEN)
+            default = "auto" if name == "efficientnet" else "none"
+            known[name]["standardize"] = Setting(default, word_of(Standardization), _STANDARDIZE)
         known["ssm"]["dimension"] = replace(known["ssm"]["dimension"], default=125)
         known["pairs"] = without(files, "database", "lengths", "image_size")
     elif group == "matching":
@@ -156,6 +161,11 @@ def choices_of(group: str) -> dict[str, dict[str, Any]]:
 def by_scorer(settings: Mapping[str, Any]) -> Mapping[str, Any]:
     """Settings of the chosen scorer, or of several, by name."""
     return {settings["method"]: settings} if "method" in settings else settings
+
+
+def by_retrieval(settings: Mapping[str, Any]) -> Mapping[str, Any]:
+    """Settings of the chosen retrieval, or of two that alternate, by name."""
+    return {settings["name"]: settings} if "name" in settings else settings
 
 
 def _check_choice(group: str, prefix: str, values: Any) -> None:
@@ -207,8 +217,12 @@ class SystemSettings:
     def __post_init__(self) -> None:
         """Raise an InputError for settings that are not allowed, by themselves or together."""
         check_fields(self)
-        for name in ("features", "retrieval", "matching"):
+        for name in ("features", "matching"):
             _check_choice(name, name, getattr(self, name))
+        for name, values in by_retrieval(self.retrieval).items():
+            _check_choice("retrieval", "retrieval" if "name" in self.retrieval else f"retrieval.{name}", values)
+        if not 1 <= len(by_retrieval(self.retrieval)) <= 2:
+            raise InputError(f"retrieval: expected one or two, got {', '.join(self.retrieval) or 'none'}")
         for name, values in by_scorer(self.scorer).items():
             _check_choice("scorer", "scorer" if "method" in self.scorer else f"scorer.{name}", values)
         local = self.features
@@ -252,13 +266,21 @@ def retriever(
     settings: Mapping[str, Any], local: features.Extractor | retrieval.FeatureFiles, data: Dataset | None
 ) -> retrieval.Retriever:
     """The retrieval of candidates; VLAD aggregates the local features that are matched as well."""
-    name, options = settings["name"], without(settings, "name", "whiten")
+    if "name" not in settings:
+        return retrieval.Alternating(*(retriever(each, local, data) for each in settings.values()))
+    name, options = settings["name"], without(settings, "name", "whiten", "standardize")
     if name == "pairs":
         files = _files("retrieval", {"database": None, **settings}, data)
         return retrieval.ShortlistFiles(files, settings["database_prefix"])
     if name == "ssm":
         return retrieval.SsmVoting(_network_extractor("retrieval", name, options))
-    search = EXACT if settings["whiten"] is None else retrieval.WhitenedSearch(settings["whiten"])
+    search, standardize = EXACT, settings["standardize"]
+    if settings["whiten"] is not None:
+        search = retrieval.WhitenedSearch(settings["whiten"])
+        if standardize not in ("none", "auto"):
+            raise InputError(f"standardize={standardize}: expected none with whiten={settings['whiten']}")
+    elif standardize != "none":
+        search = retrieval.StandardizedSearch(standardize)
     if name == "import":
         return retrieval.DescriptorFiles(_files("retrieval", options, data), options["lengths"], search)
     if name == "vlad":

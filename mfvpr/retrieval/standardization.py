@@ -1,0 +1,113 @@
+"""Global descriptors without what all images of a drive share, such as the season: minus the mean, over the deviation.
+
+The database is standardized by its own statistics. Queries are standardized by those of their drive, to which 20 images
+of the database are added, because few queries alone would lose what tells them apart.
+"""
+
+from dataclasses import dataclass
+from typing import Literal, NamedTuple
+
+import numpy as np
+from jaxtyping import Float
+
+from mfvpr.core.types import Shortlist
+from mfvpr.datasets.datasets import QuerySequence
+from mfvpr.datasets.positives import Positives
+from mfvpr.retrieval.search import EXACT, Database, ExactSearch, Queries, WhitenedSearch
+from mfvpr.utils.errors import InputError
+
+Rule = Literal["auto", "drive", "running", "database", "none"]
+PRIOR = 20  # images of the database
+_LEAST_VARIANCE = 1e-6  # relative to the mean of all dimensions; less is rounding, and counts as none
+
+
+class Moments(NamedTuple):
+    """Means of descriptors and of their squares."""
+
+    count: float  # of images
+    mean: Float[np.ndarray, " dimensions"]
+    square: Float[np.ndarray, " dimensions"]
+
+    @classmethod
+    def of(cls, vectors: Float[np.ndarray, "images dimensions"]) -> "Moments":
+        """Moments of all descriptors that are finite, float64; an InputError without any."""
+        usable = vectors[np.isfinite(vectors).all(axis=1)]
+        if not len(usable):
+            raise InputError("standardize: expected descriptors that are finite, got none")
+        squares = np.einsum("nd,nd->d", usable, usable, dtype=np.float64)
+        return cls(len(usable), usable.mean(axis=0, dtype=np.float64), squares / len(usable))
+
+    def with_images(self, vectors: Float[np.ndarray, "images dimensions"]) -> "Moments":
+        """Moments of these images and of further ones, of which those that are not finite do not count."""
+        if not np.isfinite(vectors).all(axis=1).any():
+            return self
+        new = Moments.of(vectors)
+        count = self.count + new.count
+        mix = lambda before, now: (self.count * before + new.count * now) / count  # noqa: E731
+        return Moments(count, mix(self.mean, new.mean), mix(self.square, new.square))
+
+    def standardize(self, vectors: Float[np.ndarray, "images dimensions"]) -> Float[np.ndarray, "images dimensions"]:
+        """Descriptors minus the mean, over the deviation, of unit length, float32; 0 without variance."""
+        variance = self.square - self.mean**2
+        varies = variance > _LEAST_VARIANCE * variance.mean()
+        factor = np.where(varies, 1 / np.sqrt(np.where(varies, variance, 1)), 0)
+        return _of_unit_length((vectors - self.mean.astype(np.float32)) * factor.astype(np.float32))
+
+    def center(self, vectors: Float[np.ndarray, "images dimensions"]) -> Float[np.ndarray, "images dimensions"]:
+        """Descriptors minus the mean, of unit length, float32."""
+        return _of_unit_length(vectors - self.mean.astype(np.float32))
+
+
+def _of_unit_length(vectors: np.ndarray) -> np.ndarray:
+    lengths = np.linalg.norm(vectors, axis=1, keepdims=True)
+    return (vectors / np.where(lengths > 0, lengths, 1)).astype(np.float32)
+
+
+@dataclass(frozen=True)
+class StandardizedSearch:
+    """Exact search among standardized descriptors.
+
+    Attributes:
+        standardize: `drive` uses all queries of a drive, also those behind the query; `running` uses those up to the
+            query, as a robot has to. `database` subtracts the mean of the database on both sides, for queries that are
+            not a drive in order. `auto` is `drive` where the ground truth counts frames, otherwise `database`. `none`
+            leaves descriptors as they are.
+    """
+
+    standardize: Rule = "auto"
+
+    def fit(self, database: Database) -> "StandardizedSearch":  # `shortlist` learns the statistics
+        return self
+
+    def of(self, sequence: QuerySequence) -> "StandardizedSearch":
+        """The search with the rule that `auto` stands for."""
+        if self.standardize != "auto":
+            return self
+        return StandardizedSearch("drive" if sequence.truth and sequence.truth.unit == "frames" else "database")
+
+    def shortlist(
+        self, queries: Queries, database: Database, num_candidates: int, *, excluded: Positives | None = None
+    ) -> Shortlist:
+        """Candidates of queries, which are a drive in order for `drive` and `running`; see `ExactSearch`."""
+        if self.standardize != "none":
+            queries, database = standardize(queries, database, self.standardize)
+        return EXACT.shortlist(queries, database, num_candidates, excluded=excluded)
+
+
+Search = ExactSearch | WhitenedSearch | StandardizedSearch
+
+
+def standardize(queries: Queries, database: Database, rule: Rule) -> tuple[Queries, Database]:
+    """Standardize descriptors of queries and of the database, see `StandardizedSearch`."""
+    of_database = Moments.of(database)
+    if rule == "database":
+        return of_database.center(queries), of_database.center(database)
+    drive = of_database._replace(count=PRIOR)
+    if rule == "drive":
+        return drive.with_images(queries).standardize(queries), of_database.standardize(database)
+    standardized = np.empty_like(queries, np.float32)
+    for row in range(len(queries)):
+        image = queries[row : row + 1]
+        drive = drive.with_images(image)
+        standardized[row : row + 1] = drive.standardize(image)
+    return standardized, of_database.standardize(database)
