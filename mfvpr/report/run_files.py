@@ -72,15 +72,15 @@ def heading(report: EvaluationReport, description: RunDescription) -> str:
     """Data set, numbers of images, retrieval, features and ground truth in one line."""
     dataset, settings = report.ranked.dataset, description.settings
     candidates = num_candidates(report.ranked.system.pipeline.candidates, dataset.database)
-    retrieval = settings["retrieval"].get("name") or " and ".join(settings["retrieval"])
-    rules = {
-        rule for each in dataset.sequences for rule in standardizations(report.ranked.system.pipeline.retriever, each)
-    }
+    retriever = report.ranked.system.pipeline.retriever
+    names = [settings["retrieval"].get("name") or " and ".join(settings["retrieval"])]
+    names += sorted({rule for each in dataset.sequences for rule in standardizations(retriever, each)})
+    retrieval = ", standardized by ".join(names)
     several = f" in {len(dataset.sequences)} sequences" if len(dataset.sequences) > 1 else ""
     incomplete = " (incomplete)" if any(published_differences(dataset)) else ""
     return (
         f"{dataset.name}{incomplete}: {len(report.queries)} queries{several}, {len(dataset.database)} database images, "
-        f"{candidates} candidates ({', standardized by '.join([retrieval, *sorted(rules)])}), {matched_content(settings)}; "
+        f"{candidates} candidates ({retrieval}), {matched_content(settings)}; "
         f"{description.truth_words}{description.remark}"
     )
 

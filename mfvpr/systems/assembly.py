@@ -274,7 +274,7 @@ def retriever(
         return retrieval.ShortlistFiles(files, settings["database_prefix"])
     if name == "ssm":
         return retrieval.SsmVoting(_network_extractor("retrieval", name, options))
-    search, standardize = EXACT, settings["standardize"]
+    search, standardize = EXACT, settings.get("standardize", "none")  # of maps of earlier versions
     if settings["whiten"] is not None:
         search = retrieval.WhitenedSearch(settings["whiten"])
         if standardize not in ("none", "auto"):
