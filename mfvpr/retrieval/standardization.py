@@ -14,7 +14,6 @@ from mfvpr.core.types import Shortlist
 from mfvpr.datasets.datasets import QuerySequence
 from mfvpr.datasets.positives import Positives
 from mfvpr.retrieval.search import EXACT, Database, ExactSearch, Queries, WhitenedSearch
-from mfvpr.utils.errors import InputError
 
 Rule = Literal["auto", "drive", "running", "database", "none"]
 PRIOR = 20  # images of the database
@@ -29,22 +28,24 @@ class Moments(NamedTuple):
     square: Float[np.ndarray, " dimensions"]
 
     @classmethod
-    def of(cls, vectors: Float[np.ndarray, "images dimensions"]) -> "Moments":
-        """Moments of all descriptors that are finite, float64; an InputError without any."""
+    def of(cls, vectors: Float[np.ndarray, "images dimensions"]) -> "Moments | None":
+        """Moments of all descriptors that are finite, float64; None without any."""
         usable = vectors[np.isfinite(vectors).all(axis=1)]
         if not len(usable):
-            raise InputError("standardize: expected descriptors that are finite, got none")
+            return None
         squares = np.einsum("nd,nd->d", usable, usable, dtype=np.float64)
         return cls(len(usable), usable.mean(axis=0, dtype=np.float64), squares / len(usable))
 
-    def with_images(self, vectors: Float[np.ndarray, "images dimensions"]) -> "Moments":
-        """Moments of these images and of further ones, of which those that are not finite do not count."""
-        if not np.isfinite(vectors).all(axis=1).any():
+    def joined(self, moments: "Moments | None") -> "Moments":
+        """Moments of the images of both; None = no images."""
+        if moments is None:
             return self
-        new = Moments.of(vectors)
-        count = self.count + new.count
-        mix = lambda before, now: (self.count * before + new.count * now) / count  # noqa: E731
-        return Moments(count, mix(self.mean, new.mean), mix(self.square, new.square))
+        count = self.count + moments.count
+        mean, square = (
+            (self.count * ours + moments.count * theirs) / count
+            for ours, theirs in zip(self[1:], moments[1:], strict=True)
+        )
+        return Moments(count, mean, square)
 
     def standardize(self, vectors: Float[np.ndarray, "images dimensions"]) -> Float[np.ndarray, "images dimensions"]:
         """Descriptors minus the mean, over the deviation, of unit length, float32; 0 without variance."""
@@ -100,14 +101,16 @@ Search = ExactSearch | WhitenedSearch | StandardizedSearch
 def standardize(queries: Queries, database: Database, rule: Rule) -> tuple[Queries, Database]:
     """Standardize descriptors of queries and of the database, see `StandardizedSearch`."""
     of_database = Moments.of(database)
+    if of_database is None:  # no image of the database is usable
+        return queries, database
     if rule == "database":
         return of_database.center(queries), of_database.center(database)
     drive = of_database._replace(count=PRIOR)
     if rule == "drive":
-        return drive.with_images(queries).standardize(queries), of_database.standardize(database)
-    standardized = np.empty_like(queries, np.float32)
-    for row in range(len(queries)):
-        image = queries[row : row + 1]
-        drive = drive.with_images(image)
-        standardized[row : row + 1] = drive.standardize(image)
+        standardized = drive.joined(Moments.of(queries)).standardize(queries)
+    else:
+        standardized = np.empty_like(queries, np.float32)
+        for row in range(len(queries)):
+            drive = drive.joined(Moments.of(queries[row : row + 1]))
+            standardized[row] = drive.standardize(queries[row : row + 1])[0]
     return standardized, of_database.standardize(database)
