@@ -46,9 +46,12 @@ def print_map(folder: Path) -> None:
     print(json.dumps(settings, indent=1, ensure_ascii=False))
 
 
-def calibrate(folder: Path, database: Path, queries: Path) -> None:
-    """Fit the confidence of a map on a drive: query i shows database image i, both folders of images along a path."""
-    Map.open(folder).calibrate(database, queries)
+def calibrate(folder: Path, database: Path, queries: Path, *, route: bool = False) -> None:
+    """Fit the confidence of a map on a drive: query i shows database image i, both folders of images along a path.
+
+    `route`: for mfvpr localize route=..., where the retrieval standardizes descriptors.
+    """
+    Map.open(folder).calibrate(database, queries, route=route)
     print(printable(f"{folder}: calibrated on {queries}; use threshold= of mfvpr localize"))
 
 

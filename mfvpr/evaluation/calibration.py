@@ -14,6 +14,8 @@ from mfvpr.evaluation.dataset_ranking import rank_dataset
 from mfvpr.evaluation.evidence import evidence_against
 from mfvpr.evaluation.rankings import Ranked
 from mfvpr.evaluation.system import System
+from mfvpr.retrieval.retriever import with_standardization
+from mfvpr.retrieval.standardization import Rule
 from mfvpr.storage.feature_cache import FeatureCache
 from mfvpr.utils.errors import InputError
 
@@ -67,14 +69,20 @@ def absent_ranking(ranked: Ranked, truth: Truth, threshold: float) -> Ranked:
     return Ranked(*(np.take_along_axis(each, order, axis=1) for each in values))
 
 
-def fit_on_drive(dataset: Dataset, system: System, cache: FeatureCache | None) -> tuple[Confidence, CalibrationData]:
+def fit_on_drive(
+    dataset: Dataset, system: System, cache: FeatureCache | None, rule: Rule | None = None
+) -> tuple[Confidence, CalibrationData]:
     """Fit the confidence of the ranking that decides on a data set; also what it was fitted on.
 
+    `rule` replaces that of the retrieval's standardization, if it has one.
     Each query counts twice: as it is, and without the images of its place, see `calibration_data`.
     """
     truth, root, cache = dataset.only.truth, dataset.queries.root, cache or FeatureCache()
     if truth is None:
         raise InputError(f"{dataset.name}: expected a ground truth, which says what is correct, got none")
+    if rule is not None:
+        pipeline = replace(system.pipeline, retriever=with_standardization(system.pipeline.retriever, rule))
+        system = replace(system, pipeline=pipeline)
     result, threshold = rank_dataset(dataset, system, cache=cache), middle(truth.thresholds())
     [ranked] = result.systems[system.headline]
     absent = absent_ranking(ranked, truth, threshold)
@@ -87,7 +95,7 @@ def fit_on_drive(dataset: Dataset, system: System, cache: FeatureCache | None) -
     usual_on, usual_off = _USUAL * np.array(REFUSALS)
     refusals = (on.sum() + usual_on) / (len(on) + _USUAL), (off.sum() + usual_off) / (len(off) + _USUAL)
     data = calibration_data(ranked, truth, threshold)
-    confidence = replace(data.fit(), refusals=(float(refusals[0]), float(refusals[1])))
+    confidence = replace(data.fit(), refusals=(float(refusals[0]), float(refusals[1])), standardize=rule)
     probabilities, reasons = confidence.probability(data.present), list[str]()
     if not data.num_absent:
         reason = "without the images of a query's place there are no candidates, so that places that the map does not"

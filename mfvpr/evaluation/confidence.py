@@ -67,6 +67,7 @@ class Confidence:
     bias: float  # log odds at the center
     # Shares of images without enough evidence (`mfvpr.evaluation.evidence`), of places that the database shows and not.
     refusals: tuple[float, float] = REFUSALS
+    standardize: str | None = None  # rule of the retrieval that chose the candidates; None = any
 
     def __call__(self, ranked: Ranked) -> Float[np.ndarray, " queries"]:
         """Probabilities, NaN without a prediction."""
@@ -137,7 +138,7 @@ def confidence_from_json(values: Mapping[str, Any]) -> Confidence:
     is_known = values.get("apart", APART) == APART and np.isfinite([*numbers.flat, values["bias"]]).all()
     if not (is_known and min(*scale, *shares) > 0 and min(weights) >= 0 and max(shares) <= 1):
         raise ValueError("values that make no model")
-    return Confidence(bias=values["bias"], **vectors)
+    return Confidence(bias=values["bias"], **vectors, standardize=values.get("standardize"))
 
 
 class PrecisionRecall(NamedTuple):

@@ -32,6 +32,7 @@ from mfvpr.localization import map_settings, query_steps
 from mfvpr.localization.predictions import Alternative, Localization, Prediction
 from mfvpr.localization.query_steps import Described, Describing, Image
 from mfvpr.localization.route import Route
+from mfvpr.retrieval.standardization import GrowingDatabase, Rule
 from mfvpr.storage.cache_files import pack_arrays, unpack_arrays
 from mfvpr.storage.feature_cache import FeatureCache
 from mfvpr.storage.maps import Entry, MapFile, check_entry
@@ -93,6 +94,8 @@ class Map:
         self._images, self._row_of_name = list[tuple[str, Any]](), dict[str, int]()  # (name, place)
         self._counts, self._strengths = list[int](), [0.0]  # of keypoints, and sums of strengths of the first rows
         self._vectors = np.zeros((0, 0), np.float32)  # `[rows and some more, D]`; NaN of an image without features
+        search: Any = getattr(self.system.pipeline.retriever, "search", None)
+        self._rule, self._standardized = getattr(search, "standardize", "none"), GrowingDatabase()
         self._features = OrderedDict[int, Features]()  # of the recently used rows
         self._free_bytes = SHARE * free_host_bytes() if runtime.memory is None else 1e9 * runtime.memory
         self._noise_scores: dict[int, float] = {}  # by the number of rows
@@ -148,16 +151,19 @@ class Map:
         *,
         ground_truth: GroundTruth | str = "order",
         cache: FeatureCache | None = None,
+        route: bool = False,
     ) -> Confidence:
         """Fit the confidence on a drive, and keep it in the folder of the map.
 
+        `route` says whether it is for images of a drive with a `Route`, or for single ones, where the retrieval
+        standardizes descriptors: the candidates are others.
         It holds for drives like this one. Correct is a prediction within 2 frames, or 25 m. Each query counts once more
         without the images of its place, as one of a place that the map does not show. `database` is a folder of images
         along a path, preferably another than that of the map, `queries` one of a drive along this path; for
         `ground_truth`, see `mfvpr.datasets.folder`. The cache keeps features.
         """
         dataset = folder_dataset(database, queries, ground_truth=ground_truth)
-        self.confidence, data = fit_on_drive(dataset, self.system, cache)
+        self.confidence, data = fit_on_drive(dataset, self.system, cache, self._rule_of(route))
         if (of_system := map_settings.system_fingerprint(self.system)) is None:
             warnings.warn("a part of the system names no `recipe`: the confidence is not kept on disk", stacklevel=2)
         else:
@@ -197,7 +203,13 @@ class Map:
             pixels, total = query_steps.load(image), len(self)
             described, resized = self.describing.pixels(pixels)
             end = max(0, (total if before is None else min(int(before), total)) - int(recent))
-            localized = self._localize(described, end, pixels.shape[1::-1], reason_against_image(resized))
+            reason, rule = reason_against_image(resized), self._rule_of(route is not None)
+            if self.confidence is not None and rule and self.confidence.standardize not in (None, rule):
+                got = f"{self.confidence.standardize}; calibrate with route={route is not None}"
+                raise InputError(f"confidence: expected one that was fitted with standardize={rule}, got {got}")
+            if route is not None and rule == "running" and reason is None:
+                route.see(described[1])
+            localized = self._localize(described, end, pixels.shape[1::-1], reason, route)
             if route is None:
                 return localized
             refusals = REFUSALS if self.confidence is None else self.confidence.refusals
@@ -224,12 +236,24 @@ class Map:
         if not len(self):
             raise InputError(f"{self.folder}: expected a map with images, got an empty one; add some")
 
-    def _localize(self, described: Described, end: int, size: tuple[int, int], reason: Reason | None) -> Localization:
+    def _rule_of(self, route: bool) -> Rule | None:
+        """Rule by which descriptors are standardized with or without a route; None = they are not."""
+        if self._rule == "none":
+            return None
+        return "running" if route and self._rule != "database" else "database"
+
+    def _localize(
+        self, described: Described, end: int, size: tuple[int, int], reason: Reason | None, route: Route | None = None
+    ) -> Localization:
         """Localize a described image of (width, height) px among the rows before `end`, if no reason is against it."""
         features, vector = described
         if end and strength(features) < LEAST_STRENGTH * self._strengths[end] / end:
             reason = "too few features"
-        rows, similarities = query_steps.nearest(self._vectors[:end], vector, self.candidates)
+        vectors, rule = self._vectors[:end], self._rule_of(route is not None)
+        if rule and end:
+            seen = route.seen if route is not None and rule == "running" else None
+            [vector], vectors = self._standardized.standardize(vectors, vector[None], seen)
+        rows, similarities = query_steps.nearest(vectors, vector, self.candidates)
         if reason is None and not len(rows):
             reason = "no candidates"
         if reason is not None:

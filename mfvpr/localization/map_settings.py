@@ -10,6 +10,7 @@ from mfvpr.features.extractor import Extractor
 from mfvpr.features.vlad import VladFitting
 from mfvpr.matchers.host_matcher import PairSource
 from mfvpr.retrieval.search import ExactSearch
+from mfvpr.retrieval.standardization import StandardizedSearch
 from mfvpr.storage.maps import MapFile
 from mfvpr.systems import assembly
 from mfvpr.systems.assembly import SystemSettings
@@ -35,7 +36,7 @@ def describers_of(system: System) -> tuple[Extractor, Extractor | VladFitting]:
         "a number of candidates": pipeline.candidates != "all",
         "single images; mfvpr.Route follows a drive": not (system.correlated or system.sequences),
         "retrieval by global descriptors without whitening": isinstance(
-            getattr(retriever, "search", None), ExactSearch
+            getattr(retriever, "search", None), ExactSearch | StandardizedSearch
         ),
         "descriptors of an extractor, or Aggregated(extractor, VladFitting()) of its own": is_own,
     }

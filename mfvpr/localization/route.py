@@ -27,6 +27,7 @@ from mfvpr.evaluation.confidence import REFUSALS
 from mfvpr.evaluation.drives import DEFAULT_DRIVE, Drive, DriveModel, Evidence, off_the_map
 from mfvpr.evaluation.rankings import Ranked
 from mfvpr.localization.predictions import Located, Prediction
+from mfvpr.retrieval.standardization import Moments
 from mfvpr.utils.errors import InputError
 from mfvpr.utils.numerics import compiled, round_up
 
@@ -54,12 +55,18 @@ class Route:
         if not isinstance(drive, Drive):
             raise InputError(f"Route: expected Drive(...), got {drive!r}")
         self._drive, self._warn, self._filter, self._lead = drive, warn, _Filter(drive), 0.0
+        self.seen: Moments | None = None  # of the global descriptors of the drive so far
         self._other = None if drive.advance is None else _Filter(replace(drive, advance=None))
 
     @property
     def belief(self) -> Float[np.ndarray, " rows"]:
         """Probability of each row if the robot is on the map."""
         return self._filter.by_row
+
+    def see(self, descriptor: Float[np.ndarray, " dimensions"]) -> None:
+        """Count an image of the drive in the statistics by which descriptors are standardized."""
+        if (image := Moments.of(descriptor[None])) is not None:
+            self.seen = image.joined(self.seen)
 
     def __call__(
         self, prediction: Prediction | None, there: Bool[np.ndarray, " rows"], refusals: tuple[float, float] = REFUSALS

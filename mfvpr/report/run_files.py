@@ -4,7 +4,7 @@ import itertools
 import json
 import os
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any, Literal
 
@@ -187,7 +187,14 @@ def write_run_folder(folder: Path, report: EvaluationReport, description: RunDes
         "command": description.command,
     }
     calibration = report.calibration.items()
-    fits = {name: data.fit() for name, data in calibration if np.isfinite(data.present).all(axis=1).any()}
+    rules = {
+        rule for each in report.sequences for rule in standardizations(report.ranked.system.pipeline.retriever, each)
+    }
+    fits = {
+        name: replace(data.fit(), standardize=next(iter(rules), None))
+        for name, data in calibration
+        if np.isfinite(data.present).all(axis=1).any()
+    }
     write_confidences(folder / "confidence.json", fits, provenance)
 
 

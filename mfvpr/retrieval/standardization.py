@@ -42,8 +42,8 @@ class Moments(NamedTuple):
             return self
         count = self.count + moments.count
         mean, square = (
-            (self.count * ours + moments.count * theirs) / count
-            for ours, theirs in zip(self[1:], moments[1:], strict=True)
+            (self.count * first + moments.count * second) / count
+            for first, second in zip(self[1:], moments[1:], strict=True)
         )
         return Moments(count, mean, square)
 
@@ -62,6 +62,35 @@ class Moments(NamedTuple):
 def _of_unit_length(vectors: np.ndarray) -> np.ndarray:
     lengths = np.linalg.norm(vectors, axis=1, keepdims=True)
     return (vectors / np.where(lengths > 0, lengths, 1)).astype(np.float32)
+
+
+class GrowingDatabase:
+    """Descriptors of a database that grows, standardized for one image at a time.
+
+    The statistics are those of the first n rows, where n is the largest number of 4 bits followed by zeros that is not
+    above the number of rows: they change seldom, and do not depend on when rows were added.
+    """
+
+    def __init__(self) -> None:
+        self._known = dict[str, tuple[int, Moments, np.ndarray, int]]()  # by rule; the last is the number of rows
+
+    def standardize(self, database: Database, query: Queries, drive: Moments | None) -> tuple[Queries, Database]:
+        """A query `[1, D]` and the database, by the images of a `drive` so far; None = by the database's mean."""
+        rule, size = "database" if drive is None else "running", len(database)
+        step = 1 << max(0, size.bit_length() - 4)
+        basis = size // step * step
+        known = self._known.get(rule)
+        if known is None or known[0] != basis:
+            moments = Moments.of(database[:basis])
+            if moments is None:
+                return query, database
+            known = basis, moments, np.empty((basis + step, database.shape[1]), np.float32), 0
+        _, moments, rows, done = known
+        rows[done:size] = (moments.center if drive is None else moments.standardize)(database[done:size])
+        self._known[rule] = (basis, moments, rows, max(done, size))
+        if drive is None:
+            return moments.center(query), rows[:size]
+        return moments._replace(count=PRIOR).joined(drive).standardize(query), rows[:size]
 
 
 @dataclass(frozen=True)
