@@ -20,7 +20,7 @@ from mfvpr.evaluation.evidence import evidence_against
 from mfvpr.report.evaluations import EvaluationReport, confidence_table, recall_table
 from mfvpr.report.figures import query_figures
 from mfvpr.report.pages import write_report
-from mfvpr.report.run_files import RunDescription, ground_truth, heading, write_run_folder
+from mfvpr.report.run_files import RunDescription, ground_truth, heading, standardizations_of, write_run_folder
 from mfvpr.report.runs import Figure
 from mfvpr.retrieval.retriever import standardizations, with_standardization
 from mfvpr.systems import assembly
@@ -85,6 +85,10 @@ def evaluation_of(settings: Evaluate) -> Outcome:
     ranked = replace(ranked, seconds={**watch.seconds, **ranked.seconds})
     lacking = None if settings.threshold is None else evidence_against(ranked, inputs.cache)
     report = EvaluationReport(ranked, inputs.thresholds, settings.recall.ks, confidences, settings.threshold, lacking)
+    rules = " and ".join(standardizations_of(report))
+    if confidences and (fitted := confidences[report.headline].standardize) not in (None, rules):
+        expected = f"one that was fitted with standardize={rules or 'none'}, got {fitted}"
+        raise InputError(f"confidence={settings.confidence}: expected {expected}; set retrieval.standardize")
     described = {name: values[name] for name in _NAMES} | {"scorer": assembly.describe_settings(settings.scorer)}
     truth, remark = inputs.ground_truth, running_in_words(report, inputs)
     of_run = truth, truth_in_words(truth), inputs.contents, described, settings.command

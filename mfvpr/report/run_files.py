@@ -72,10 +72,8 @@ def heading(report: EvaluationReport, description: RunDescription) -> str:
     """Data set, numbers of images, retrieval, features and ground truth in one line."""
     dataset, settings = report.ranked.dataset, description.settings
     candidates = num_candidates(report.ranked.system.pipeline.candidates, dataset.database)
-    retriever = report.ranked.system.pipeline.retriever
-    names = [settings["retrieval"].get("name") or " and ".join(settings["retrieval"])]
-    names += sorted({rule for each in dataset.sequences for rule in standardizations(retriever, each)})
-    retrieval = ", standardized by ".join(names)
+    names = settings["retrieval"].get("name") or " and ".join(settings["retrieval"])
+    retrieval = ", standardized by ".join([names, *standardizations_of(report)])
     several = f" in {len(dataset.sequences)} sequences" if len(dataset.sequences) > 1 else ""
     incomplete = " (incomplete)" if any(published_differences(dataset)) else ""
     return (
@@ -83,6 +81,12 @@ def heading(report: EvaluationReport, description: RunDescription) -> str:
         f"{candidates} candidates ({retrieval}), {matched_content(settings)}; "
         f"{description.truth_words}{description.remark}"
     )
+
+
+def standardizations_of(report: EvaluationReport) -> list[str]:
+    """The rules by which the retrieval standardized descriptors, of all sequences."""
+    retriever = report.ranked.system.pipeline.retriever
+    return sorted({rule for each in report.sequences for rule in standardizations(retriever, each)})
 
 
 def matched_content(settings: Mapping[str, Any]) -> str:
@@ -187,11 +191,9 @@ def write_run_folder(folder: Path, report: EvaluationReport, description: RunDes
         "command": description.command,
     }
     calibration = report.calibration.items()
-    rules = {
-        rule for each in report.sequences for rule in standardizations(report.ranked.system.pipeline.retriever, each)
-    }
+    rules = " and ".join(standardizations_of(report)) or None
     fits = {
-        name: replace(data.fit(), standardize=next(iter(rules), None))
+        name: replace(data.fit(), standardize=rules)
         for name, data in calibration
         if np.isfinite(data.present).all(axis=1).any()
     }
