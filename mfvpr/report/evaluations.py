@@ -78,8 +78,9 @@ class EvaluationReport:
         """
         truth, rows = self.truth, list[dict[str, Any]]()
         if truth is None:
-            names = self.ranked.systems
-            return [{"system": name, "decides": name == self.headline, "recall_at": {}} for name in names]
+            parts = [{"sequence": sequence.name} for sequence in self.sequences] if len(self.sequences) > 1 else [{}]
+            systems = [{"system": name, "decides": name == self.headline} for name in self.ranked.systems]
+            return [system | part | {"recall_at": {}} for system in systems for part in parts]
         for system, recall in self.ranked.recall(self.thresholds, self.ks).items():
             parts = dict(zip((sequence.name for sequence in self.sequences), recall.by_sequence, strict=True))
             if len(parts) > 1:

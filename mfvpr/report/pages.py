@@ -22,8 +22,8 @@ from mfvpr.evaluation.confidence import PrecisionRecall
 from mfvpr.evaluation.rankings import RETRIEVAL
 from mfvpr.evaluation.statistics import Estimate, estimate, mcnemar, path_test
 from mfvpr.io.containers import reading
-from mfvpr.report.evaluations import sequence_folder
-from mfvpr.report.figures import ABOUT
+from mfvpr.report.evaluations import NO_PLACE, sequence_folder
+from mfvpr.report.figures import ABOUT, REFUSED
 from mfvpr.report.runs import LAST, Table, file_names, format_estimate, format_interval, read_csv, table_of
 from mfvpr.utils.errors import InputError
 from mfvpr.utils.files import require_replaceable, write_text
@@ -36,7 +36,7 @@ _PICTURE_WIDTH, _QUALITY = 1000, 75  # px, of JPEG: some 60 kB each
 _POLICY = b"default-src 'none'; script-src "  # at the start of every page
 _TEMPLATES = Path(__file__).parent / "templates"
 _EXPECTED = "expected the run folder of an evaluation of this version"
-_NAMELESS = "folder"  # the default name of a data set of own folders
+_NAMELESS = "folder"  # the default name of a data set
 _CURVE_POINTS = 200
 _POOLED = MEANS[-1]
 _OUTCOMES = {"1": "correct", "0": "incorrect", "": "best"}  # by `correct` of predictions
@@ -138,16 +138,20 @@ class Run:
         """The first candidates of all systems for each query that has one, those of the system that decides first.
 
         A row has texts: `system`, `sequence`, `query`, `prediction`, `score`; `outcome`, which is "correct",
-        "incorrect", or "best" without ground truth; and the rank of the `first_correct`, empty without one.
+        "incorrect", "best" without ground truth, or "refused" if the system that decides predicts no place; and the
+        rank of the `first_correct`, empty without one.
         """
         systems, files = sorted(self.systems, key=lambda name: name != self.headline), file_names(self.systems)
         for system, (number, sequence) in itertools.product(systems, enumerate(self.sequences)):
-            folder = sequence_folder(self.folder, self.sequences, number) / "predictions"
-            rows = read_csv(folder / f"{files[system]}.csv")
+            folder = sequence_folder(self.folder, self.sequences, number)
+            rows = read_csv(folder / "predictions" / f"{files[system]}.csv")
+            decided = read_csv(folder / "predictions.csv") if system == self.headline else []
+            refused = {row["query"] for row in decided if row["database"] == NO_PLACE}
             ranks = {row["query"]: row["rank"] for row in reversed(rows) if row["correct"] == "1"}
             for row in rows:
                 if row["rank"] == "1":
                     outcome, rank = _OUTCOMES[row["correct"]], ranks.get(row["query"], "")
+                    outcome = REFUSED if row["query"] in refused else outcome
                     about = {"system": system, "sequence": sequence, "outcome": outcome, "first_correct": rank}
                     yield {"query": row["query"], "prediction": row["database"], "score": row["score"], **about}
 
@@ -190,8 +194,8 @@ def write_report(folder: Path, path: Path | None = None) -> Path:
         pictures, predictions = run.pictures(), [*itertools.islice(run.predictions(), MOST_PREDICTIONS + 1)]
     per_query = 1 / max(common["queries"], 1)
     seconds = [[stage, f"{value:.3f}", f"{value * per_query:.4f}"] for stage, value in common["seconds"].items()]
-    made = {name: run.about.get(name) for name in ("command", "commit")}
-    made |= {name.replace("_", " "): common[name] for name in ("ground_truth", "data_fingerprint")}
+    provenance = {name: run.about.get(name) for name in ("command", "commit")}
+    provenance |= {name.replace("_", " "): common[name] for name in ("ground_truth", "data_fingerprint")}
     skipped = run.tables.get("skipped", [])
     title, dataset = common["dataset"], run.about["settings"]["dataset"]
     if title == _NAMELESS and isinstance(dataset.get("queries"), str):  # the ends of the paths of its folders
@@ -207,7 +211,7 @@ def write_report(folder: Path, path: Path | None = None) -> Path:
         is_cut=len(predictions) > MOST_PREDICTIONS,
         seconds=Table(["stage", "seconds", "per query"], seconds),
         run=run,
-        made=made,
+        provenance=provenance,
         systems={row["system"]: row["parameters"] for row in run.results},
         skipped=skipped and table_of(skipped, [*skipped[0]]),
         **recall,
@@ -242,7 +246,7 @@ def write_comparison(folders: Sequence[Path], path: Path) -> None:
         path,
         "comparison.html",
         title=f"{', '.join(dict.fromkeys(run.common['dataset'] for run in runs.values()))}: {len(runs)} runs compared",
-        words="The systems that decide, beside each other; each run has a page of its own.",
+        words="The systems that decide, beside each other; each run also has a page.",
         facts=facts,
         runs=Table(header, overview, text_columns=4),
         differing=Table(["name", *settings], [row for row in rows if len({*row[1:]}) > 1], 1 + len(settings)),
@@ -261,8 +265,8 @@ def _write_search_page(folder: Path, results: Mapping[str, Any], path: Path) -> 
         tables = {caption: table_of(rows, [*rows[0]][:1])}
     title, _, words = heading.partition(": ")
     settings = {name: value for name, value in results.items() if name not in _IN_TABLES}
-    found = {"text": summary.removeprefix(heading).strip(), "images": figures, "tables": tables}
-    parts = {"Results": found} | ({"Settings and versions": {"tables": {"Run": settings}}} if settings else {})
+    content = {"text": summary.removeprefix(heading).strip(), "images": figures, "tables": tables}
+    parts = {"Results": content} | ({"Settings and versions": {"tables": {"Run": settings}}} if settings else {})
     write_page(path, title=title, words=words, facts={}, parts=parts)
 
 
