@@ -161,9 +161,9 @@ def search_checks() -> Iterator[Check]:
 
     def search(shortlist: Callable[..., Any]) -> tuple[Any, ...]:
         """Scores, and similarities of the rows in float64."""
-        found = shortlist(queries, database, num_candidates=50)
-        similarities = np.take_along_axis(similarity, np.asarray(found.indices), axis=1)
-        return np.stack([found.scores, similarities]), np.stack([expected] * 2)
+        result = shortlist(queries, database, num_candidates=50)
+        similarities = np.take_along_axis(similarity, np.asarray(result.indices), axis=1)
+        return np.stack([result.scores, similarities]), np.stack([expected] * 2)
 
     for name, function in (("retrieve", mfvpr.retrieve), ("ExactSearch", ExactSearch().shortlist)):
         yield f"search, {name}", partial(search, function), TIE

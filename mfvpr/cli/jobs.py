@@ -228,10 +228,10 @@ def _warn_of_settings(settings: Common, dataset: Dataset, contents: Mapping[str,
 # --- the run folder ----------------------------------------------------------------------------------------------
 
 
-def claim(out: str | None, dataset: str, *, own: bool = False) -> AbstractContextManager[Path]:
+def claim(out: str | None, dataset: str, *, is_exclusive: bool = False) -> AbstractContextManager[Path]:
     """The run folder `out`, for this run alone, see `claim_run_folder`; None = a new one of a data set."""
     folder = expand_user(out) if out else Path("runs", dataset, f"{datetime.now():%Y-%m-%d_%H-%M-%S}")
-    return runs.claim_run_folder(folder, numbered=not out, own=own)
+    return runs.claim_run_folder(folder, numbered=not out, is_exclusive=is_exclusive)
 
 
 def write_results(

@@ -153,6 +153,7 @@ def load_exported(folder: Path | str) -> ExportedProgram:
     An `InputError` if a file is missing, or if this version of JAX cannot read the program.
     """
     folder = Path(folder)
+    _require("flatbuffers", "load_exported")
     with reading(folder / DESCRIPTION, "a folder of mfvpr.export with this file", "export it again"):
         description = json.loads((folder / DESCRIPTION).read_text(encoding="utf-8"))
         if description["format"] != FORMAT:

@@ -318,8 +318,8 @@ def _depths_chart(curves: Curves) -> Chart:
 
 def _tolerance_chart(curves: Curves) -> Chart:
     """Recall of all queries over the threshold, of the runs with several thresholds in the unit of the first."""
-    points, (run, _) = dict[str, list[tuple[float, float]]](), next(iter(curves.values()))
-    unit, k = run.common["ground_truth"]["unit"], min(run.common["recall_at"], key=int)
+    points, (first, _) = dict[str, list[tuple[float, float]]](), next(iter(curves.values()))
+    unit, k = first.common["ground_truth"]["unit"], min(first.common["recall_at"], key=int)
     for name, (run, system) in curves.items():
         if len(run.thresholds) > 1 and run.common["ground_truth"]["unit"] == unit and k in run.common["recall_at"]:
             rows = [row for row in run.results if row["system"] == system]
@@ -348,19 +348,20 @@ def _precision_chart(curves: Curves, by: str) -> Chart:
 def _differences(curves: Curves) -> dict[str, Table]:
     """Tests of every two curves, query by query, and the pairs that cannot be compared."""
     rows, incomparable = [], []
-    for (name, (run, system)), (other, (second, other_system)) in itertools.combinations(curves.items(), 2):
-        differing = {
-            "other images": run.common["data_fingerprint"] != second.common["data_fingerprint"],
-            "another ground truth": run.common["ground_truth"] != second.common["ground_truth"],
-            "other queries": (run.queries, run.sequences) != (second.queries, second.sequences),
+    for names in itertools.combinations(curves, 2):
+        (run1, system1), (run2, system2) = (curves[name] for name in names)
+        reasons = {
+            "other images": run1.common["data_fingerprint"] != run2.common["data_fingerprint"],
+            "another ground truth": run1.common["ground_truth"] != run2.common["ground_truth"],
+            "other queries": (run1.queries, run1.sequences) != (run2.queries, run2.sequences),
         }
-        if any(differing.values()):
-            incomparable.append([name, other, next(words for words, differs in differing.items() if differs)])
+        if any(reasons.values()):
+            incomparable.append([*names, next(reason for reason, holds in reasons.items() if holds)])
             continue
-        hits = run.hits(system), second.hits(other_system)
+        hits = run1.hits(system1), run2.hits(system2)
         test, path = mcnemar(*hits), path_test(*hits)
         numbers = (f"{value:.2g}" for value in (test.p_value, *path))
-        rows.append([name, other, str(test.only_first), str(test.only_second), *numbers])
+        rows.append([*names, str(test.only_first), str(test.only_second), *numbers])
     header = ["system", "other", "only system", "only other", "McNemar p", "queries worth one", "p along the path"]
-    reasons = Table(["run", "other", "why"], incomparable, text_columns=3)
-    return {"differences": Table(header, rows, text_columns=2), "incomparable": reasons}
+    pairs = Table(["run", "other", "why"], incomparable, text_columns=3)
+    return {"differences": Table(header, rows, text_columns=2), "incomparable": pairs}
