@@ -286,9 +286,9 @@ def largest_difference(arrays: dict[str, np.ndarray], expected: dict[str, np.nda
     return max(differences)
 
 
-def _require(package: str, what: str) -> None:
+def _require(package: str, option: str) -> None:
     if find_spec(package) is None:
-        raise InputError(f"{what}: expected the package {package}, got none; pip install 'mfvpr[export]'")
+        raise InputError(f"{option}: expected the package {package}, got none; pip install 'mfvpr[export]'")
 
 
 def _one_line(error: Exception) -> str:

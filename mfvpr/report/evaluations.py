@@ -136,7 +136,7 @@ class EvaluationReport:
     def probabilities(self) -> dict[str, Float[np.ndarray, "2 queries"]]:
         """Confidence by system, of the queries as they are, and without the images of their place.
 
-        Without `confidences`, each half of the path has those of a fit on the other, without what shows places of both.
+        Without `confidences`, each half of the path has those of a fit on the other half, without places of both.
         NaN without a prediction, or without anything to fit on.
         """
         names = self.calibration if self.confidences is None else self.confidences

@@ -237,7 +237,7 @@ def write_comparison(folders: Sequence[Path], path: Path) -> None:
         about = {name: run.about.get(name) for name in ("command", "commit", "settings", "ground_truth")}
         about |= {name: run.common[name] for name in ("data_fingerprint", "versions", "seconds")}
         settings[label] = dict(flat(about))
-    header, recall = ["run", "data set", "decides", "what was evaluated"], dict[str, Any]()
+    header, recall = ["run", "data set", "decides", "description"], dict[str, Any]()
     if known := {label: run for label, run in runs.items() if run.queries}:
         recall = _recall(known, {f"{label}: {run.headline}": (run, run.headline) for label, run in known.items()})
     names = dict.fromkeys(name for values in settings.values() for name in values)
