@@ -152,8 +152,7 @@ MIXVPR = Table(
 
 ALIKED = Table(
     {
-        r"(block\d\.conv\d|conv\d)": r"\1",
-        r"(block\d\.conv\d)\.regular_conv": r"\1",  # the deformable convolution's
+        r"(block\d\.conv\d|conv\d)(?:\.regular_conv)?": r"\1",  # regular_conv in deformable convolutions
         r"(block\d\.conv\d)\.offset_conv": r"\1.offset",
         r"(block\d\.bn\d)": r"\1",
         r"(block\d)\.downsample": r"\1.shortcut",

@@ -24,7 +24,7 @@ from mfvpr.utils.errors import InputError
 from mfvpr.utils.files import IMAGE_SUFFIXES
 from mfvpr.utils.fingerprints import fingerprint, recipe_of
 
-OwnRows = tuple[tuple[int, ...], ...]  # database rows of files with the content of each query
+IdenticalRows = tuple[tuple[int, ...], ...]  # database rows of files with the content of each query
 MEANS = ("mean", "pooled")  # names in results of the means over sequences, and over all of their queries
 
 
@@ -104,7 +104,7 @@ class QuerySequence:
         truth = type(self.truth).__name__ if self.truth else "no ground truth"
         return f"QuerySequence({self.name}: {len(self.images)} queries, {truth})"
 
-    def without_neighbors(self, num_database: int, query_rows: OwnRows, neighbors: int) -> "QuerySequence":
+    def without_neighbors(self, num_database: int, query_rows: IdenticalRows, neighbors: int) -> "QuerySequence":
         """Exclude each query and its neighbors within `neighbors` frames from its candidates; 0 = the query alone.
 
         Excluded images are not correct either. `query_rows` are the rows of each query in the database, a sequence of
