@@ -13,12 +13,12 @@ from dataclasses import dataclass
 from functools import partial
 from itertools import chain
 from pathlib import Path, PurePosixPath
-from typing import Any, ClassVar, Literal
+from typing import ClassVar, Literal
 
 import numpy as np
-from jaxtyping import Float, Float64, Int, Num
+from jaxtyping import Float, Int, Num
 
-from mfvpr.datasets.positives import Positives, positives_within
+from mfvpr.datasets.positives import Positives, positives_within, require_positions
 from mfvpr.io.containers import parse_number, read_npz, reading, require_all, shorten
 from mfvpr.utils.errors import InputError
 
@@ -30,7 +30,6 @@ CHOICES = (
     "@easting@northing@...); label (two csv files of name,label: images with the same label (floor, room) are "
     "correct); none (rankings only)"
 )
-FARTHEST = 1e9  # meters; beyond, distances are not exact to a centimeter
 _LINES = "lines (with an empty cell if it has no place or label)"
 _reading = partial(reading, kind="a ground truth file", mend="see mfvpr/datasets/README.md")
 
@@ -128,6 +127,8 @@ class FrameTruth(Truth):
 class RadiusTruth(Truth):
     """Positions in meters; database images within a radius of the query are correct.
 
+    An `InputError` for positions that are not finite, or farther than 1e9 m from 0.
+
     Example:
         xy = np.stack([2.0 * np.arange(10), np.zeros(10)], axis=1)  # a position every 2 m
         mfvpr.datasets.RadiusTruth(query_xy=xy[5:6], database_xy=xy).positives(4.0).of(0)  # [3, 4, 5, 6, 7]
@@ -136,6 +137,10 @@ class RadiusTruth(Truth):
     unit: ClassVar[Unit] = "m"
     query_xy: Num[np.ndarray, "queries 2"]
     database_xy: Num[np.ndarray, "database 2"]
+
+    def __post_init__(self) -> None:
+        for side in ("query_xy", "database_xy"):
+            object.__setattr__(self, side, require_positions(side, getattr(self, side)))
 
     def positives(self, threshold: float) -> Positives:
         return positives_within(self.query_xy, self.database_xy, threshold)
@@ -191,15 +196,6 @@ class AllowedTruth(Truth):
         distance = np.array(self.truth.distance(query), np.float64)
         distance[self.excluded.of(query)] = np.inf
         return distance
-
-
-def require_positions(where: str, xy: Any, count: int) -> Float64[np.ndarray, "images 2"]:
-    """Positions in meters as float64; an InputError unless there is one for each of `count` images."""
-    xy = np.asarray(xy, np.float64)
-    if xy.shape != (count, 2) or not (np.abs(xy) <= FARTHEST).all():  # NaN neither
-        got = f"{[*xy.shape]} up to {np.abs(xy).max(initial=0):g} m"
-        raise InputError(f"{where}: expected positions [{count}, 2] of all images, at most {FARTHEST:g} m, got {got}")
-    return xy
 
 
 def truth_from_names(query_names: Sequence[str], database_names: Sequence[str]) -> RadiusTruth:

@@ -12,8 +12,8 @@ import numpy as np
 import scipy  # its subpackages are imported at their first use
 
 from mfvpr.datasets.datasets import Dataset, ImageFolder, QuerySequence, image_folder
-from mfvpr.datasets.ground_truth import FARTHEST, FrameTruth, RadiusTruth, Truth, require_positions, truth_from_file
-from mfvpr.datasets.positives import positives_within
+from mfvpr.datasets.ground_truth import FrameTruth, RadiusTruth, Truth, truth_from_file
+from mfvpr.datasets.positives import FARTHEST, positives_within, require_positions
 from mfvpr.io.containers import parse_number, reading
 from mfvpr.utils.errors import InputError
 
