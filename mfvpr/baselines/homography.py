@@ -313,10 +313,7 @@ def through(four: Float[Array, "coordinates=4 matches=4 samples"]) -> Float[Arra
 
 
 def is_inlier(model: Array, points: Array, threshold: Array) -> Array:
-    """Whether H p1 is within the threshold of p0: models `[9, ...]` and a match `[4]`, or a model and matches.
-
-    A point at infinity, whose last coordinate w is 0, is never an inlier.
-    """
+    """Whether H p1 is finite and close to p0: models `[9, ...]` and a match `[4]`, or a model and matches."""
     x1, y1, x0, y0 = jnp.moveaxis(points, -1, 0)
     u, v, w = (model[row] * x1 + model[row + 1] * y1 + model[row + 2] for row in (0, 3, 6))
     u, v, limit = u - x0 * w, v - y0 * w, threshold * w  # both sides times the last coordinate of H p1

@@ -174,7 +174,7 @@ def entry_of(name: str) -> Entry:
         return REGISTRY[name]
     nearest = difflib.get_close_matches(name, REGISTRY, n=1)
     hint = f"the nearest is {nearest[0]}" if nearest else "see mfvpr weights list"
-    raise InputError(f"{name}: no weights of this name; {hint}")
+    raise InputError(f"{name}: expected the name of published weights; {hint}")
 
 
 class Blueprint(NamedTuple):

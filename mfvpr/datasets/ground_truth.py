@@ -97,6 +97,11 @@ class FrameTruth(Truth):
     widened: bool = True
     starts: tuple[int, ...] = ()
 
+    def __post_init__(self) -> None:
+        if (rows := {*chain(*self.rows)}) and not 0 <= min(rows) <= max(rows) < self.num_database:
+            expected, got = f"rows of a database of {self.num_database} images", f"{min(rows)} to {max(rows)}"
+            raise InputError(f"rows: expected {expected}, got {got}; an unknown place has no rows")
+
     @property
     def unit(self) -> Unit:
         return "frames" if self.widened else "exact"
@@ -125,9 +130,7 @@ class FrameTruth(Truth):
 
 @dataclass(frozen=True)
 class RadiusTruth(Truth):
-    """Positions in meters; database images within a radius of the query are correct.
-
-    An `InputError` for positions that are not finite, or farther than 1e9 m from 0.
+    """Positions in meters, finite, up to 1e9; database images within a radius of the query are correct.
 
     Example:
         xy = np.stack([2.0 * np.arange(10), np.zeros(10)], axis=1)  # a position every 2 m
@@ -256,7 +259,7 @@ def truth_from_file(
         elif path.suffix.lower() == ".json":
             content = json.loads(path.read_text(encoding="utf-8"))
             if not all(isinstance(entry, list) and len(entry) == 2 and isinstance(entry[1], list) for entry in content):
-                raise InputError("expected [[query, [database, ...]], ...] as in VPR-Bench")
+                raise InputError("expected [[query, [database, ...]], ...] as in VPR-Bench, got others; convert it")
             content = [(query, place) for query, places in content for place in (places or [""])]
         elif path.suffix.lower() == ".npz":
             arrays = read_npz(path, ("utmQ", "utmDb", "query", "database"))
@@ -264,10 +267,10 @@ def truth_from_file(
                 sides = ("utmQ", query_names), ("utmDb", database_names)
                 return RadiusTruth(*(require_positions(name, arrays[name], len(names)) for name, names in sides))
             if not {"query", "database"} <= arrays.keys():
-                raise InputError("expected arrays query and database, or utmQ and utmDb, got neither")
+                raise InputError("expected arrays query and database, or utmQ and utmDb, got neither; rename them")
             content = list(zip(arrays["query"].tolist(), arrays["database"].tolist(), strict=True))
         else:
-            raise InputError(f"expected a file named .csv, .npz, .json, got {path.suffix or 'no suffix'}")
+            raise InputError(f"expected a file named .csv, .npz, .json, got {path.suffix or 'no suffix'}; convert it")
     sides = ("query", query_names, _row_table(query_names)), ("database", database_names, _row_table(database_names))
     rows: dict[int, list[int]] = {}
     for line, pair in enumerate(content, start=1):

@@ -31,7 +31,7 @@ class Positives:
 
     def __post_init__(self) -> None:
         if np.ndim(self.matrix) != 2:
-            raise InputError(f"positives: expected a matrix [queries, database], got shape {np.shape(self.matrix)}")
+            raise InputError(f"positives: expected a matrix [Q, N], got shape {np.shape(self.matrix)}; see from_rows")
         matrix = scipy.sparse.csr_array(self.matrix, dtype=bool)
         if not matrix.has_canonical_format or not matrix.data.all():
             matrix = matrix.copy()  # of the caller, perhaps
@@ -174,9 +174,7 @@ def frame_positives(
 def radius_positives(
     query_xy: Num[np.ndarray, "queries 2"], database_xy: Num[np.ndarray, "database 2"], *, radius: float = 25.0
 ) -> Bool[np.ndarray, "queries database"]:
-    """Positives by position: at most `radius` meters apart. Coordinates are UTM, of any type of numbers.
-
-    An `InputError` for coordinates that are not finite, or farther than 1e9 m from 0.
+    """Positives by position: at most `radius` meters apart. Coordinates are UTM, finite, of any type of numbers.
 
     Example:
         query_xy, database_xy = np.array([[0.0, 1.0]]), np.array([[0.0, 0.0], [0.0, 40.0]])

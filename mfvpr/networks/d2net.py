@@ -55,8 +55,8 @@ def _repeats(images: layers.Images) -> Bool[Array, ""]:
         same = jnp.pad(same, ((0, 0), (0, missing[0]), (0, missing[1])), constant_values=True)
         same = jnp.all(same.reshape(batch, rows, STRIDE, columns, STRIDE), axis=(2, 4))
         for axis in (1, 2):
-            padding = [(-before, after) if axis == other else (0, 0) for other in range(3)]
-            window = [after - before + 1 if axis == other else 1 for other in range(3)]
+            padding = [(-before, after) if dimension == axis else (0, 0) for dimension in range(3)]
+            window = [after - before + 1 if dimension == axis else 1 for dimension in range(3)]
             same = lax.reduce_window(same, True, lax.bitwise_and, window, (1, 1, 1), padding)
         repeats |= jnp.any(same)
     return repeats

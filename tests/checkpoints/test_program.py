@@ -57,7 +57,7 @@ def tiny_checkpoint(tmp_path):
         (["add", "some.pth"], "some.pth: no such file"),
         (["add", "some.pth", "--as", "d2_tff"], "the nearest is d2_tf"),
         (["add", "nowhere/d2_tf.pth"], "nowhere/d2_tf.pth: expected a checkpoint file"),
-        (["verify", "d2"], "d2: no weights of this name; "),
+        (["verify", "d2"], "d2: expected the name of published weights; "),
         (["download", "d2_tf"], "d2_tf: no hash is published"),
         (["download", "vgg16_places365"], "get vgg16_places365.npy from https://imr.ciirc.cvut.cz/uploads/"),
     ],

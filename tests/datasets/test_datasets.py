@@ -14,7 +14,7 @@ from tests.builders import fill
 from tests.io.checks import one_line_error
 
 
-@pytest.mark.parametrize(("name", "words"), [("no", "got nothing"), ("empty", "found none"), ("file", "a file")])
+@pytest.mark.parametrize(("name", "words"), [("no", "got nothing"), ("empty", "got none"), ("file", "a file")])
 def test_missing_and_empty_folders(tmp_path, name, words):
     (tmp_path / "empty").mkdir()
     (tmp_path / "file").write_text("")
@@ -47,10 +47,10 @@ def test_linked_folders_are_followed(tmp_path):
 @pytest.mark.parametrize(
     ("place", "target", "words"),
     [
-        ("sub/back", "..", "back: a link back to "),
+        ("sub/back", "..", "back: expected files and folders, got a link back to "),
         ("sub/up", "../..", "a link back to "),
-        ("self", "self", "self: a link to nothing"),
-        ("gone", "nowhere", "gone: a link to nothing"),
+        ("self", "self", "self: expected an image or a folder, got a link to nothing"),
+        ("gone", "nowhere", "gone: expected an image or a folder, got a link to nothing"),
     ],
 )
 def test_links_in_circles_or_to_nothing_are_errors(tmp_path, place, target, words):

@@ -142,11 +142,9 @@ def test_positions_of_any_numbers_do_not_wrap_around(dtype):
     np.testing.assert_array_equal(radius_positives(queries, database, radius=5), [[False, True, True]])
 
 
-@pytest.mark.parametrize(
-    "xy", [[[np.nan, 0.0]], [[np.inf, 0.0]], [[1e10, 0.0]], [["a", "b"]], [[1j, 0]], [[True, False]]]
-)
-def test_positions_without_a_meaning_are_errors(xy):
-    place = np.zeros((1, 2))
+@pytest.mark.parametrize("first", [np.nan, np.inf, 1e10, "a", 1j, True])
+def test_positions_without_a_meaning_are_errors(first):
+    place, xy = np.zeros((1, 2)), [[first, first]]
     with unchecked_shapes():
         for call in (lambda: RadiusTruth(np.array(xy), place), lambda: radius_positives(np.array(xy), place)):
             with pytest.raises(InputError, match=r"query_xy: expected positions \[1, 2\] .*, got .*; remove images"):
@@ -164,6 +162,13 @@ def test_memory_grows_with_the_positives_not_with_all_pairs():
     np.testing.assert_array_equal(positives.counts, [3, 4, *[5] * 49_996, 4, 3])
     assert positives.of(1500).tolist() == [1498, 1499, 1500, 1501, 1502]  # of the second block
     assert peak < 2**26  # as float64, all distances would take 20 GB
+
+
+@pytest.mark.parametrize("row", [-1, 3])
+def test_frames_beyond_the_database_are_errors(row):
+    got = f"{min(row, 0)} to {max(row, 0)}"
+    with pytest.raises(InputError, match=f"rows: expected rows of a database of 3 images, got {got}"):
+        FrameTruth(((0,), (), (row,)), 3)
 
 
 @pytest.mark.parametrize("tolerance", [0, 1, 4, 10**6])

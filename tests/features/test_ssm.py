@@ -138,7 +138,7 @@ def test_what_has_no_cells_or_has_not_seen_the_database_is_refused(model, cells)
         SsmCells(model, (48, 16))
     with pytest.raises(InputError, match="stride=0"):
         SsmCells(model, stride=0)
-    with pytest.raises(InputError, match="SsmCells: has not seen the database; take"):
+    with pytest.raises(InputError, match="SsmCells: expected a learned whitening, got settings; call"):
         cells(np.zeros((1, 40, 48, 3), np.uint8))
     with pytest.raises(InputError, match=r"SsmCells: .*whitening .*4608 .*got .*41472"):
         replace(cells, whitening=Whitening(np.zeros(41472), np.zeros((3, 41472))))(np.zeros((1, 40, 48, 3), np.uint8))
