@@ -43,7 +43,7 @@ class D2Net(nnx.Module):
 def _repeats(images: layers.Images) -> Bool[Array, ""]:
     """Whether two neighbors in a map of any image have equal receptive fields, as in a white sky.
 
-    The map is constant there, but rounding can create peaks. layers.Pixels outside the images count as equal.
+    The map is constant there, but rounding can create peaks. Pixels outside the images count as equal.
     """
     batch, height, width, _ = images.shape
     rows, columns = -(-height // STRIDE), -(-width // STRIDE)
@@ -84,7 +84,7 @@ def extract(
     scales: Sequence[float] = (1.0,),
     share: float = 1.0,
 ) -> tuple[layers.Detections, ...]:
-    """Keypoints of images: one layers.Detections per scale, each with a leading axis `batch`.
+    """Keypoints of images: `Detections` for each scale, each with a leading axis `batch`.
 
     Args:
         images: RGB, 0 .. 255, at least 12 px high and wide at every scale.

@@ -137,8 +137,8 @@ def test_weights_of_ones_own_are_never_taken_for_the_published_ones(
     assert not folder.exists()
     code, stdout, stderr = program("add", tiny_checkpoint, "--own", "mine")
     assert (code, stderr) == (0, "")
-    own = f"own/mine, {PARAMETERS} parameters, your own for the network of tiny; use it as weights=own/mine\n"
-    assert stdout == f"{folder}/own/mine.safetensors: {own}"
+    message = f"own/mine, {PARAMETERS} parameters, your own for the network of tiny; use it as weights=own/mine\n"
+    assert stdout == f"{folder}/own/mine.safetensors: {message}"
     converted = tiny_checkpoint.with_name("converted.safetensors")
     (folder / "own" / "mine.safetensors").rename(converted)
     assert program("add", converted, "--own", "mine", "--as", "tiny")[0] == 0
