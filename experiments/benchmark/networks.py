@@ -15,7 +15,7 @@ from experiments.benchmark.harness import Entry, ready, ready_torch, torch_or_no
 from mfvpr import features
 from mfvpr.checkpoints import entry_of, is_installed
 from mfvpr.checkpoints.files import load
-from mfvpr.checkpoints.networks import NETWORKS, blueprint
+from mfvpr.checkpoints.networks import plan_network
 from mfvpr.datasets import read_image, resize
 from mfvpr.datasets.streets import draw_streets
 from mfvpr.features.network import TOGETHER, compile_network
@@ -85,7 +85,7 @@ def torch_entries(
     from experiments.benchmark import torch_networks
 
     device, entries = "cpu" if jax.default_backend() == "cpu" else "cuda", list[Entry]()
-    table, network = NETWORKS[contest.checkpoint].table, getattr(torch_networks, contest.peer)
+    table, network = entry_of(contest.checkpoint).table, getattr(torch_networks, contest.peer)
     for title, layout in (("torch", torch.contiguous_format), ("torch, channels last", torch.channels_last)):
         weights = torch_networks.torch_weights(arrays, table, device, layout)
         run = partial(ready_torch, torch_networks.run_network, network, weights=weights, device=device, layout=layout)
@@ -102,7 +102,7 @@ def torch_entries(
 def make_network(name: str) -> tuple[Any, dict[str, np.ndarray]]:
     """A network of mfvpr and its arrays by path: the published ones if they are installed, otherwise random."""
     entry = entry_of(name)
-    plan = blueprint(entry)
+    plan = plan_network(entry.builder())
     arrays = load(name) if is_installed(entry) else {path: _random(path, shape) for path, shape in plan.shapes.items()}
     return plan.build(arrays), arrays
 
