@@ -141,9 +141,8 @@ class Dataset:
         """The only sequence; InputError if there are several."""
         if len(self.sequences) != 1:
             names = ", ".join(sequence.name for sequence in self.sequences)
-            raise InputError(
-                f"{self.name}: expected one query sequence, got {len(self.sequences)}; choose one of {names}"
-            )
+            got = f"{len(self.sequences)}; choose one of {names}"
+            raise InputError(f"{self.name}: expected one query sequence, got {got}")
         return self.sequences[0]
 
     @property

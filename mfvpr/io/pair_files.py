@@ -340,9 +340,8 @@ def _matches_of(file: Path, result: Mapping[str, Any], verified: bool) -> FileMa
         real = numbers >= 0
         shapes = {points0.shape[:1], numbers.shape, (numbers if confidence is None else confidence).shape}
         if len(shapes) > 1 or numbers.dtype.kind not in "iu" or (numbers[~real] != -1).any():
-            raise InputError(
-                f"{file}: expected matches [N] of keypoints0 [N, 2], a row of keypoints1 or -1, got others"
-            )
+            expected = "matches [N] of keypoints0 [N, 2], a row of keypoints1 or -1"
+            raise InputError(f"{file}: expected {expected}, got others")
         if real.any() and numbers.max() >= len(points1):
             raise InputError(f"{file}: expected matches below the {len(points1)} keypoints1, got {numbers.max()}")
         return FileMatches(
