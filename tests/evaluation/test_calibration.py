@@ -137,8 +137,7 @@ MODEL = {"center": [0, 0], "scale": [1, 1], "weights": [0, 1], "bias": 0.5, "ref
     {"refusals": [0.2, 1.1]}, {"center": [0, math.nan]}, {"center": [0, 0, 0]}, {"scale": [1]}, {"bias": "1"},
 ])  # fmt: skip
 def test_values_of_other_rows_or_versions_make_no_model(change):
-    assert confidence_from_json(MODEL | {"apart": 5}) == confidence_from_json(MODEL)
-    assert confidence_from_json(MODEL).weights == (0, 1)
+    assert confidence_from_json(MODEL | {"apart": 5}).weights == (0, 1)
     with pytest.raises((TypeError, ValueError)):
         confidence_from_json(MODEL | change)
 

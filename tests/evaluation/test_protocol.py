@@ -1,5 +1,7 @@
 """The protocol of choosing and reporting, against loops over queries."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -7,7 +9,7 @@ from mfvpr import InputError, Shortlist, frame_positives
 from mfvpr.datasets import AllowedTruth, FrameTruth, LabelTruth, Positives, RadiusTruth
 from mfvpr.datasets.ground_truth import middle
 from mfvpr.evaluation import best_setting, evaluation_protocol, halves, neighboring_settings
-from mfvpr.evaluation.protocol import places_along_path
+from mfvpr.evaluation.protocol import halves_of_map, places_along_path
 
 QUERIES, TOLERANCES, SETTINGS = 20, (0, 1, 3), 4
 TRUTH = FrameTruth(tuple((row,) for row in range(QUERIES)), QUERIES)
@@ -104,6 +106,17 @@ def test_positions_are_reported_along_their_path_however_names_sort_them(split):
     assert len(changes) == 1  # neighbors of the street are neighbors
 
 
+def test_reported_sets_stay_apart_each_along_its_path():
+    """Sets are joined behind the queries that are learned on, whatever places they share."""
+    positions = np.stack([10.0 * np.random.default_rng(0).permutation(12), np.zeros(12)], axis=1)
+    protocol = evaluation_protocol(RadiusTruth(positions, positions), [12.0])
+    order = replace(protocol, reported_sets={"b": 4, "c": 5}).order
+    for start, end in ((0, 3), (3, 7), (7, 12)):
+        assert sorted(order[start:end]) == [*range(start, end)]
+        along = positions[order[start:end], 0]
+        assert along.tolist() in (sorted(along), sorted(along, reverse=True))
+
+
 PLACES = 60
 DRIVES = [*range(PLACES), *reversed(range(0, PLACES, 2))]  # there and back
 
@@ -155,6 +168,13 @@ def test_halves_never_share_a_place(tolerance):
     assert sorted(reported) == list(range(20))
     first, second = halves(positives)
     assert len(first.tune) == len(second.tune) == 10 - 2 * tolerance
+
+
+@pytest.mark.parametrize("rows", [[0, 0, 0, 20], [0, 20, 20, 20], [20, 0, 0, 0, 9]])
+def test_both_halves_of_a_map_have_queries_where_most_show_one_place(rows):
+    for half in halves_of_map([Positives.from_rows([[row] for row in rows], 21)], "frames"):
+        assert 0 < len(half.tune) < len(rows) == len(half.tune) + len(half.report)
+        assert not {rows[query] for query in half.tune} & {rows[query] for query in half.report}
 
 
 def test_neighbors_are_one_step_along_one_axis():
