@@ -15,7 +15,7 @@ from typing import Any, Literal
 from mfvpr import features, retrieval
 from mfvpr.baselines.learned_weight import SUFFIX, WORDS, named_weight
 from mfvpr.baselines.scorers import SCORERS
-from mfvpr.checkpoints import REGISTRY, load_model, own_entries
+from mfvpr.checkpoints import REGISTRY, custom_entries, load_model
 from mfvpr.core import Scorer
 from mfvpr.core.scorer import parameters_of
 from mfvpr.core.weights import WEIGHTS
@@ -294,7 +294,7 @@ def _network_extractor(group: str, name: str, settings: Mapping[str, Any]) -> An
 
 def _network(group: str, names: tuple[str, ...], weights: str) -> Any:
     """A network of one of these names, with its converted weights."""
-    known = [entry.name for entry in (*REGISTRY.values(), *own_entries()) if entry.network in names]
+    known = [entry.name for entry in (*REGISTRY.values(), *custom_entries()) if entry.network in names]
     if weights not in known:
         raise InputError(f"{group}.weights={weights}: expected weights of {names[0]}: one of {', '.join(known)}")
     return load_model(weights)

@@ -117,7 +117,7 @@ def test_radius_is_inclusive_and_keeps_centimeters_at_utm_size():
     queries, places = rng.uniform(0, 100, (20, 2)), rng.uniform(0, 100, (30, 2))
     expected = oracles.radius_positives(queries, places, 25.0)
     np.testing.assert_array_equal(radius_positives(queries, places), expected)
-    with unchecked_shapes(), pytest.raises(InputError, match=r"expected \(x, y\) \[images, 2\]"):
+    with unchecked_shapes(), pytest.raises(InputError, match=r"query_xy: expected positions \[2, 2\]"):
         radius_positives(np.ones((2, 3)), np.ones((2, 3)))
 
 
