@@ -1,26 +1,19 @@
 """Reasons against images and predictions, without a map."""
 
-import shutil
 from types import SimpleNamespace
 
 import cv2
 import numpy as np
 import pytest
-from PIL import Image
 
-from mfvpr import Map
 from mfvpr.core.types import Features, Shortlist
-from mfvpr.datasets import folder
 from mfvpr.datasets.image_reading import read_image, resize
-from mfvpr.evaluation import rank_dataset
 from mfvpr.evaluation.evidence import evidence_against, reason_against, reason_against_image
 from mfvpr.evaluation.rankings import Ranked
 from mfvpr.evaluation.system import noise_images
-from mfvpr.features import Sift, VladFitting
 from mfvpr.features.feature_set import strength
 from mfvpr.retrieval import FeatureFiles
-from mfvpr.storage import FeatureCache
-from tests.builders import make_matches, map_system, match_set_of
+from tests.builders import make_matches, match_set_of
 
 SIZES = [(320, 320), (160, 120), (512, 192)]
 
@@ -58,24 +51,6 @@ def test_the_least_evidence_is_enough():
     for score, noise in ((12.0, 10.0), (0.0, 0.0), (np.nan, 10.0), (1.0, np.nan)):
         assert (reason_against(8, score, noise), reason_against(7, score, noise)) == (None, "too few matches")
     assert reason_against(8, 11.99, 10.0) == "no better than noise"
-
-
-@pytest.mark.thorough
-def test_an_evaluation_and_a_map_lack_the_same_evidence(small_street, tmp_path):
-    """A street, its upper edge, white, dark noise, strong noise, and nothing, which the database has as well."""
-    (tmp_path / "queries").mkdir()
-    shutil.copytree(small_street / "database", tmp_path / "database")
-    Image.new("RGB", (320, 240)).save(tmp_path / "database/0009.png")
-    street, noise = read_image(small_street / "database/0003.png"), noise_images((320, 240), seeds=(5,))[0]
-    corner = np.where(np.arange(320)[:, None] < 40, street, 0).astype(np.uint8)
-    for number, image in enumerate((street, corner, street | 252, noise // 64, noise, 0 * street)):
-        Image.fromarray(image).save(tmp_path / f"queries/{number}.png")
-    system = map_system(Sift(max_keypoints=60, image_size=(160, 120)), VladFitting(num_words=8), candidates=5)
-    dataset = folder(tmp_path / "database", tmp_path / "queries", ground_truth="none")
-    [reasons] = evidence_against(rank_dataset(dataset, system), FeatureCache())
-    known = Map.create(tmp_path / "map", dataset.database, system)
-    assert reasons == [known.localize(path).reason for path in dataset.queries.paths]
-    assert reasons == [None, None, *["too few features"] * 2, "no better than noise", "too few features"]
 
 
 def test_the_evidence_is_that_of_the_prediction_whatever_the_order_of_the_retrieval():

@@ -39,13 +39,6 @@ def street(small_street, tmp_path_factory):
     return Map.create(tmp_path_factory.mktemp("map") / "map", small_street / "database", small("steering"))
 
 
-def test_a_map_is_opened_by_its_folder_alone(street, small_street):
-    again = Map.open(street.folder)
-    query = small_street / "queries/0003.png"
-    assert again.names == street.names
-    assert again.localize(query) == street.localize(query)
-
-
 def test_a_map_in_the_shape_of_its_images_is_the_same_when_it_is_opened_again(small_street, tmp_path):
     system = small("steering", features={"max_keypoints": 60, "image_size": "auto"})
     with pytest.raises(InputError, match="expected the images of a new map"):
