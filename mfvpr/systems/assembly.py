@@ -168,6 +168,8 @@ def _check_choice(group: str, prefix: str, values: Any) -> None:
     if group == "scorer" and isinstance(values.get("weight"), list) and "weight" in known:
         known = {**known, "weight": replace(known["weight"], rule=list_of(known["weight"].rule))}
     check_values(known, without(values, key), f"{prefix}.")
+    if missing := [name for name in known if name not in values]:
+        raise InputError(f"{prefix}.{missing[0]}: expected a value of {choice}, got none")
 
 
 @dataclass(frozen=True)
@@ -209,22 +211,24 @@ class SystemSettings:
         check_fields(self)
         for name in ("features", "retrieval", "matching"):
             _check_choice(name, name, getattr(self, name))
+        if not self.scorer:
+            raise InputError("scorer: expected at least one, got none")
         for name, values in by_scorer(self.scorer).items():
             _check_choice("scorer", "scorer" if "method" in self.scorer else f"scorer.{name}", values)
-        local = self.features
-        if self.scorer.get("method") == "grid":  # which takes the cells of features in a square grid
+        local, scorers = self.features, by_scorer(self.scorer).values()
+        for grid in (values for values in scorers if values["method"] == "grid"):  # of cells of features in a square
             if local["name"] not in ("ssm", "import") and self.matching["name"] != "import":
                 raise InputError(f"scorer=grid: expected features=ssm, whose features are cells, got {local['name']}")
             check = self.matching.get("cross_check", self.matching["name"])
             if check != "candidate":
                 raise InputError(f"matching.cross_check={check}: expected candidate, so that every cell has a match")
             cells = [(-(-pixels // 8) - 3) // local.get("stride", 1) + 1 for pixels in local["image_size"] or []]
-            if local["name"] == "ssm" and cells != [self.scorer["side"]] * 2:
-                raise InputError(f"scorer.side={self.scorer['side']}: expected the {cells} cells of the images")
+            if local["name"] == "ssm" and cells != [grid["side"]] * 2:
+                raise InputError(f"scorer.side={grid['side']}: expected the {cells} cells of the images")
         if local["name"] == "patch_netvlad":  # of whose patches the scorer `rapid` takes the largest place
             sides = local["image_size"]
             largest = [[16 * (pixels // 16 - patch) for pixels in sides] for patch in local["patch_sizes"]]
-            for values in by_scorer(self.scorer).values():
+            for values in scorers:
                 size = values.get("size")
                 if size is not None and [[*size]] != largest:
                     raise InputError(f"scorer.size={size}: expected the patches' largest place, {largest[0]}, or null")
@@ -328,9 +332,8 @@ def _files(group: str, settings: Mapping[str, Any], data: Dataset | None) -> dic
         root, path = sequence.images.root, expand_user(queries[index if len(queries) > 1 else 0])
         file = File(path, settings["query_prefix"])
         if files.setdefault(root, file) != file:
-            raise InputError(
-                f"{group}.queries={path}: expected file and prefix of {group}.database, both are of {root}"
-            )
+            expected = f"file and prefix of {group}.database, both are of {root}"
+            raise InputError(f"{group}.queries={path}: expected {expected}")
     return files
 
 

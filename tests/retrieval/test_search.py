@@ -60,8 +60,6 @@ def test_the_largest_in_blocks_are_the_largest(columns, kind):
         scores, indices = retrieval._largest_in_blocks(values.astype(np.float32), depth)
         np.testing.assert_array_equal(indices, expected)
         np.testing.assert_array_equal(scores, np.take_along_axis(values.astype(np.float32), expected, axis=1))
-    queries, database = unit(rng.normal(size=(6, 3))), unit(rng.normal(size=(columns, 3)))
-    assert retrieve(queries, database, num_candidates=3).mask.all()
 
 
 @pytest.mark.optimized
