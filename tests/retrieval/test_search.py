@@ -25,11 +25,6 @@ def test_shortlist_is_the_exact_order():
     assert shortlist.mask.all()
 
 
-def test_shortlist_deeper_than_the_database_ends_in_minus_one():
-    shortlist = retrieve(np.eye(2, dtype=np.float32), np.eye(2, dtype=np.float32), num_candidates=4)
-    np.testing.assert_array_equal(shortlist.indices, [[0, 1, -1, -1], [1, 0, -1, -1]])
-
-
 def test_a_descriptor_that_is_not_finite_never_appears():
     database = np.eye(3, dtype=np.float32)
     database[1] = np.nan
