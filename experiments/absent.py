@@ -45,16 +45,16 @@ def run(drives: list[str], features: str) -> None:
     data = {name: fit_on_drive(dataset, system, cache)[1] for name, dataset in datasets.items()}
     present = {name: (values.present, values.correct) for name, values in data.items()}
     absent = defaultdict[str, list[Ranked]](list)
-    for place, other in itertools.permutations(datasets, 2):
-        elsewhere = replace(datasets[place], sequences=(replace(datasets[other].only, truth=None),))
+    for place, drive in itertools.permutations(datasets, 2):
+        elsewhere = replace(datasets[place], sequences=(replace(datasets[drive].only, truth=None),))
         [ranked] = rank_dataset(elsewhere, system, cache=cache).systems[system.headline]
         absent[place].append((confidence_inputs(ranked), np.zeros(len(ranked.rows), bool)))
     header = ["fitted on", "queries count", "ECE, %", "absent, answered, %", "present and correct, answered, %"]
     rows = []
     for name in datasets:
-        others = [other for other in datasets if other != name]
+        here = [parts for place, parts in present.items() if place != name]
+        elsewhere = [part for place, parts in absent.items() if place != name for part in parts]
         for turns, confidence in (("once", fit_confidence(*present[name])), ("twice", data[name].fit())):
-            here, elsewhere = [present[other] for other in others], [each for other in others for each in absent[other]]
             rows.append([name, turns, *row(confidence, here, elsewhere)])
     print(Table(header, rows, 2).markdown())
 

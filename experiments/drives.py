@@ -13,9 +13,7 @@ def main(program: str, description: str | None) -> None:
     """Run the program `experiments.PROGRAM:run` with the drives and the features of the command line."""
 
     def add_arguments(parser: Parser) -> None:
-        parser.add_argument(
-            "drives", nargs="+", metavar="NAME=DATABASE:QUERIES", help="drives, by names of your choice"
-        )
+        parser.add_argument("drives", nargs="+", metavar="NAME=DATABASE:QUERIES", help="by names of your choice")
         parser.add_argument("--features", default="aliked", metavar="NAME", help="choice of the group features")
         parser.set_defaults(run=f"experiments.{program}:run")
 

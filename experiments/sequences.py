@@ -116,8 +116,8 @@ def lines(places: Mapping[str, Sequence[Place]]) -> Iterator[list[str]]:
             yield [name, drive, *(f"{100 * recall:.1f}" for recall in hits.mean(axis=1))]
     for drive, of_sets in pooled.items():
         path, hits = (np.concatenate(each, axis=-1) for each in zip(*of_sets, strict=True))
-        (alone, *others), cells = hits[:, np.argsort(path, kind="stable")], []
-        for correct in others:
+        (alone, *methods), cells = hits[:, np.argsort(path, kind="stable")], []
+        for correct in methods:
             gain, p = correct.mean() - alone.mean(), path_test(correct, alone).p_value
             cells.append(f"{100 * correct.mean():.1f} ({100 * gain:+.1f}, p {p:.3f})")
         yield ["all", drive, f"{100 * alone.mean():.1f}", *cells]

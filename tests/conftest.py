@@ -17,7 +17,7 @@ from mfvpr.checkpoints import entry_of
 from mfvpr.checkpoints.checkpoint import read_checkpoint
 from mfvpr.checkpoints.conversion import convert
 from mfvpr.checkpoints.files import save
-from mfvpr.checkpoints.networks import NETWORKS, blueprint
+from mfvpr.checkpoints.networks import plan_network
 from mfvpr.datasets import Dataset
 from mfvpr.datasets.streets import streets_folder
 from tests import random_checkpoints
@@ -140,8 +140,8 @@ def install_weights(root: Path, checkpoints: Iterable[tuple[str, dict[str, np.nd
         for name, tensors in checkpoints:
             entry, source = entry_of(name), root / f"{name}.source"
             source.write_text("not published")
-            plan = blueprint(entry)
-            save(entry, convert(tensors, NETWORKS[name].table, plan.shapes), source, parameters=plan.parameters)
+            plan = plan_network(entry.builder())
+            save(entry, convert(tensors, entry.table, plan.shapes), source, parameters=plan.parameters)
     return root
 
 

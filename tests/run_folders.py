@@ -48,8 +48,11 @@ def ranking(ranks):
     return Ranked(np.array(rows), np.array(ROWS)[:, None] + 10.0 - np.arange(CANDIDATES))
 
 
-def write_run(folder, *, sequences=("</style><b onclick=alert(3)>",), ranks=RANKS, truth=True, **changes):
-    """A run folder; `changes` of what all rows of its results say alike. Sequences share the places of one map."""
+def write_run(folder, *, sequences=("</style><b onclick=alert(3)>",), ranks=RANKS, truth=True, refused=(), **changes):
+    """A run folder; `changes` of what all rows of its results say alike. Sequences share the places of one map.
+
+    Queries in `refused` have no place, for low confidence.
+    """
     known = FrameTruth(tuple((row,) for row in ROWS), len(ROWS)) if truth else None
     drives = tuple(QuerySequence(name, ImageFolder("queries", HOSTILE), known) for name in sequences)
     scores = {name: SimpleNamespace(name=name, base=None, step=None, scorers=()) for name in ranks}
@@ -65,7 +68,9 @@ def write_run(folder, *, sequences=("</style><b onclick=alert(3)>",), ranks=RANK
     names = {"retrieval": {"name": HOSTILE[0]}, "features": {"name": HOSTILE[1]}, "matching": {}}
     settings = names | {"scorer": {name: {"a": [1, "<"]} for name in ranks}}
     description = RunDescription(about, "no ground truth: rankings only", {}, settings)
-    write_run_folder(folder, EvaluationReport(ranked, TOLERANCES, KS), description)
+    fits = {HEADLINE: lambda ranked: np.where(np.isin(np.arange(len(ranked.rows)) % len(ROWS), refused), 0.1, 0.9)}
+    report = EvaluationReport(ranked, TOLERANCES, KS, *((fits, 0.5) if refused else ()))
+    write_run_folder(folder, report, description)
     rows = json.loads((folder / "results.json").read_text("utf-8"))
     write_json(folder / "results.json", [row | {"versions": {"mfvpr": "</script>"}} | changes for row in rows])
     settings = {"out": HOSTILE[5], "a": {}, "dataset": {}}
@@ -73,6 +78,7 @@ def write_run(folder, *, sequences=("</style><b onclick=alert(3)>",), ranks=RANK
     for number, name in enumerate(sequences):
         for outcome, query in (("correct", 0), ("incorrect", 6)):
             place = folder / "figures" / (name if len(drives) > 1 else "")
+            outcome = "refused" if query in refused else outcome
             _write_figure(place / f"{outcome}_{number:04d}.png", name, query)
     return folder
 

@@ -38,8 +38,8 @@ NETWORKS = {  # checkpoint -> side of the images in px, result; weights are rand
 }
 
 
-# What is checked; a function that returns the device's result, its reference, and maybe how many entries differ without
-# ties of float32; and the share by which results may deviate.
+# Name; a function that returns the device's result, its reference, and maybe how many entries differ without a tie of
+# float32; and the largest allowed deviation, relative.
 Check = tuple[str, Callable[[], tuple[Any, ...]], float]
 
 
@@ -51,12 +51,12 @@ def check_all(_: int) -> Rows:
 
 def check(task: Check) -> dict[str, Any]:
     """Row of a check: the greatest deviation, relative to the largest entry of the reference."""
-    what, compute, allowed = task
+    name, compute, allowed = task
     result, expected, differ = (*compute(), 0)[:3]
     result, expected = (np.asarray(values, np.float64) for values in (result, expected))
     deviation = float(np.max(np.abs(result - expected)) / (np.max(np.abs(expected)) or 1.0))  # NaN is not exact
     is_exact = "yes" if deviation <= allowed and not differ else "NO"
-    return {"what": what, "exact": is_exact, "deviation": deviation, "allowed": allowed, "differ": differ}
+    return {"check": name, "exact": is_exact, "deviation": deviation, "allowed": allowed, "differ": differ}
 
 
 @cache
@@ -82,7 +82,7 @@ def matches(**options: Any) -> Matches:
         return jax.tree.map(np.asarray, mfvpr.match_candidates(*images(), **options))
 
 
-def beside_float64(what: str, function: Callable[..., Any], *inputs: Any, allowed: float = 1e-5) -> Check:
+def beside_float64(name: str, function: Callable[..., Any], *inputs: Any, allowed: float = 1e-5) -> Check:
     """Check results of a function on the device beside those on the CPU with all numbers in float64."""
 
     def widen(leaf: Any) -> Any:
@@ -94,7 +94,7 @@ def beside_float64(what: str, function: Callable[..., Any], *inputs: Any, allowe
         with jax.enable_x64(True), jax.default_device(cpu), jax.numpy_dtype_promotion("standard"):
             return result, np.asarray(function(*jax.tree.map(widen, inputs)))
 
-    return what, compute, allowed
+    return name, compute, allowed
 
 
 def matching_checks() -> Iterator[Check]:
@@ -161,9 +161,9 @@ def search_checks() -> Iterator[Check]:
 
     def search(shortlist: Callable[..., Any]) -> tuple[Any, ...]:
         """Scores, and similarities of the rows in float64."""
-        found = shortlist(queries, database, num_candidates=50)
-        similarities = np.take_along_axis(similarity, np.asarray(found.indices), axis=1)
-        return np.stack([found.scores, similarities]), np.stack([expected] * 2)
+        result = shortlist(queries, database, num_candidates=50)
+        similarities = np.take_along_axis(similarity, np.asarray(result.indices), axis=1)
+        return np.stack([result.scores, similarities]), np.stack([expected] * 2)
 
     for name, function in (("retrieve", mfvpr.retrieve), ("ExactSearch", ExactSearch().shortlist)):
         yield f"search, {name}", partial(search, function), TIE

@@ -3,7 +3,6 @@
 All implementations of a step run in turns after a warm-up, so that other load on the machine slows them all alike.
 """
 
-import argparse
 import os
 from collections.abc import Callable, Sequence
 from itertools import product
@@ -86,7 +85,6 @@ def main() -> None:
 
 def add_arguments(parser: Parser) -> None:
     """Declare the command line."""
-    parser.formatter_class = argparse.RawDescriptionHelpFormatter
     lines = [f"  {name:<12} {about} ({rounds} rounds)" for name, (about, rounds, _) in BENCHMARKS.items()]
     parser.epilog = "\n".join(["benchmarks:", *lines])
     parser.add_argument("benchmark", nargs="?", choices=BENCHMARKS, default="scores", help="default: scores")

@@ -41,7 +41,7 @@ def measure(entries: Sequence[Entry], rounds: int) -> Rows:
             times.append(duration(call))
     rows, medians = [], {entry: float(np.median(times)) for entry, times in seconds.items()}
     for step in dict.fromkeys(step for step, _ in seconds):
-        names = [name for other, name in seconds if other == step]
+        names = [name for entry_step, name in seconds if entry_step == step]
         for name in sorted(names, key=lambda name: medians[step, name]):
             low, median, high = (1e3 * float(np.quantile(seconds[step, name], share)) for share in (0.25, 0.5, 0.75))
             row = {"step": step, "implementation": name, "median, ms": median, "quartiles, ms": [low, high]}

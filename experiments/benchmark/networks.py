@@ -12,19 +12,12 @@ import jax
 import numpy as np
 
 from experiments.benchmark.harness import Entry, ready, ready_torch, torch_or_none
+from mfvpr import features
 from mfvpr.checkpoints import entry_of, is_installed
 from mfvpr.checkpoints.files import load
-from mfvpr.checkpoints.networks import NETWORKS, blueprint
+from mfvpr.checkpoints.networks import plan_network
 from mfvpr.datasets import read_image, resize
 from mfvpr.datasets.streets import draw_streets
-from mfvpr.features import (
-    AlikedFeatures,
-    D2NetFeatures,
-    GlobalDescriptor,
-    MixVprDescriptor,
-    PatchNetVladFeatures,
-    SelaVprFeatures,
-)
 from mfvpr.features.network import TOGETHER, compile_network
 from mfvpr.networks.layers import preprocess
 
@@ -48,20 +41,20 @@ def _dense_map(model: Any, image_size: tuple[int, int], batch_size: int) -> Call
     return lambda batch: ready(lambda: [program(batch[at : at + step]) for at in range(0, len(batch), step)])()
 
 
-_aliked = partial(AlikedFeatures, threshold=0.1)  # the paper's
-_patches, _large_patches = (partial(PatchNetVladFeatures, patch_sizes=sizes) for sizes in ((5,), (2, 5, 8)))
+_aliked = partial(features.AlikedFeatures, threshold=0.1)  # the paper's
+_patches, _large_patches = (partial(features.PatchNetVladFeatures, patch_sizes=sizes) for sizes in ((5,), (2, 5, 8)))
 PLACES, MAPILLARY = (640, 480), "patchnetvlad_mapillary"  # px of the images; checkpoints
 CONTESTS = (  # features and descriptors are timed from host to host
     Contest("D2-Net dense map", D2NET, (336, 336), _dense_map, "d2net_map"),
-    Contest("D2-Net features", D2NET, (336, 336), D2NetFeatures),
-    Contest("MixVPR descriptor", MIXVPR, (320, 320), MixVprDescriptor, "mixvpr"),
+    Contest("D2-Net features", D2NET, (336, 336), features.D2NetFeatures),
+    Contest("MixVPR descriptor", MIXVPR, (320, 320), features.MixVprDescriptor, "mixvpr"),
     Contest("aliked-n16 features", ALIKED, (320, 320), _aliked, "aliked"),
     Contest("aliked-n32 features", "aliked-n32", (320, 320), _aliked, "aliked"),
-    Contest("NetVLAD descriptor", f"{MAPILLARY}_512", PLACES, GlobalDescriptor),
+    Contest("NetVLAD descriptor", f"{MAPILLARY}_512", PLACES, features.GlobalDescriptor),
     Contest("Patch-NetVLAD features, sizes 5, 512 dimensions", f"{MAPILLARY}_512", PLACES, _patches),
     Contest("Patch-NetVLAD features, sizes 2, 5, 8, 4096 dimensions", f"{MAPILLARY}_4096", PLACES, _large_patches),
-    Contest("generalized mean of ResNet-50", "cosplace_resnet50_2048", PLACES, GlobalDescriptor),
-    Contest("SelaVPR features", "selavpr_msls", (224, 224), SelaVprFeatures),
+    Contest("generalized mean of ResNet-50", "cosplace_resnet50_2048", PLACES, features.GlobalDescriptor),
+    Contest("SelaVPR features", "selavpr_msls", (224, 224), features.SelaVprFeatures),
 )
 ON_ACCELERATOR = CONTESTS[:4]
 
@@ -92,7 +85,7 @@ def torch_entries(
     from experiments.benchmark import torch_networks
 
     device, entries = "cpu" if jax.default_backend() == "cpu" else "cuda", list[Entry]()
-    table, network = NETWORKS[contest.checkpoint].table, getattr(torch_networks, contest.peer)
+    table, network = entry_of(contest.checkpoint).table, getattr(torch_networks, contest.peer)
     for title, layout in (("torch", torch.contiguous_format), ("torch, channels last", torch.channels_last)):
         weights = torch_networks.torch_weights(arrays, table, device, layout)
         run = partial(ready_torch, torch_networks.run_network, network, weights=weights, device=device, layout=layout)
@@ -109,7 +102,7 @@ def torch_entries(
 def make_network(name: str) -> tuple[Any, dict[str, np.ndarray]]:
     """A network of mfvpr and its arrays by path: the published ones if they are installed, otherwise random."""
     entry = entry_of(name)
-    plan = blueprint(entry)
+    plan = plan_network(entry.builder())
     arrays = load(name) if is_installed(entry) else {path: _random(path, shape) for path, shape in plan.shapes.items()}
     return plan.build(arrays), arrays
 

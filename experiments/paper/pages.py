@@ -28,7 +28,7 @@ def write_pages(
         links += [(f"{dataset}: {run}", folder / PAGE) for run, folder in folders.items()]
     addresses = [(words, quote(path.relative_to(out).as_posix())) for words, path in links if path.is_file()]
 
-    about: dict[str, Any] = {"Left out": Table(["what", "why"], left_out, text_columns=2)} if left_out else {}
+    about: dict[str, Any] = {"Left out": Table(["name", "reason"], left_out, text_columns=2)} if left_out else {}
     about["Versions"] = versions()
     costs = dict(tables[name] for name in ("sizes", "seconds") if name in tables)
     recalls = dict(table for name, table in tables.items() if name not in ("data_sets", "sizes", "seconds"))

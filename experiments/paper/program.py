@@ -27,7 +27,7 @@ Folders = dict[tuple[str, str], Path]  # run folders by data set and evaluation
 
 
 def paper(settings: Paper) -> None:
-    """Evaluate what is not evaluated yet, then write tables, and print the recalls."""
+    """Evaluate unless finished runs exist, then write tables, and print the recalls."""
     rows = systems.chosen_rows(settings.systems)
     places, left_out = systems.places(settings.data, settings.datasets)
     for run in _names(rows) if places else ():
@@ -35,8 +35,8 @@ def paper(settings: Paper) -> None:
             needs = [f"{entry.name} ({entry.file}): {how_to_install(entry)}" for entry in missing]
             left_out.append((run, f"needs {'; '.join(needs)}"))
             rows = [row for row in rows if row.run != run]
-    for what, why in left_out:
-        tell(f"left out: {what}: {why}")
+    for name, reason in left_out:
+        tell(f"left out: {name}: {reason}")
     if not places or not rows:
         raise InputError("nothing to evaluate: the lines above say what is missing")
     names, out = _names(rows), expand_user(settings.out)
@@ -86,9 +86,9 @@ def evaluate_all(
     """Evaluate; return readable data sets, run folders of finished evaluations, and the failed ones."""
     datasets, finished, failures = dict[str, Dataset](), Folders(), list[LeftOut]()
 
-    def fail(what: str, error: InputError) -> None:
-        failures.append((what, str(error)))
-        tell(f"left out: {what}: {error}")
+    def fail(name: str, error: InputError) -> None:
+        failures.append((name, str(error)))
+        tell(f"left out: {name}: {error}")
 
     for number, place in enumerate(places):
         try:

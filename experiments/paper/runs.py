@@ -1,4 +1,4 @@
-"""The evaluations, each in a run folder of its own and not repeated; the seconds of a query, by step."""
+"""The evaluations, each in its run folder and not repeated; the seconds of a query, by step."""
 
 import json
 import tempfile
@@ -56,9 +56,9 @@ def lock_output(out: Path) -> Iterator[None]:
 def settings_of(run: str, place: Place, settings: Paper) -> Evaluate:
     """The checked settings of an evaluation."""
     chosen = [*place.settings, *overrides(run, place.name), "figures=2"]
-    own = {name: getattr(settings, name) for name in ("cache", "memory", "devices")}
-    own |= {"out": str(folder_of(run, place.name, settings)), "command": f"mfvpr evaluate {' '.join(chosen)}"}
-    return replace(checked("evaluate", compose("evaluate", chosen)), **own)
+    changes = {name: getattr(settings, name) for name in ("cache", "memory", "devices")}
+    changes |= {"out": str(folder_of(run, place.name, settings)), "command": f"mfvpr evaluate {' '.join(chosen)}"}
+    return replace(checked("evaluate", compose("evaluate", chosen)), **changes)
 
 
 def folder_of(run: str, dataset: str, settings: Paper) -> Path:
@@ -87,15 +87,15 @@ def is_finished_with(inputs: Mapping[str, str], folder: Path) -> bool:
     if read_json(folder / LAST) is None or read_json(folder / SIZES) is None:
         return False
     before = read_json(folder / INPUTS) or {}
-    if other := [name for name, value in inputs.items() if before.get(name) != value]:
+    if differing := [name for name, value in inputs.items() if before.get(name) != value]:
         mend = "remove it, or name another folder with out=DIR"
-        raise InputError(f"{folder}: a finished run of other {' and '.join(other)} is there; {mend}")
+        raise InputError(f"{folder}: a finished run of other {' and '.join(differing)} is there; {mend}")
     return True
 
 
 def evaluate(settings: Evaluate, inputs: Mapping[str, str]) -> None:
     """Evaluate into the run folder, without a table in the terminal."""
-    with jobs.claim(settings.out, settings.dataset["name"], own=True) as folder:
+    with jobs.claim(settings.out, settings.dataset["name"], is_exclusive=True) as folder:
         outcome = evaluation.evaluation_of(settings)
         with writing(folder) as new:
             write_run_folder(new, outcome.report, outcome.description)

@@ -18,7 +18,7 @@ from mfvpr.utils.files import expand_user
 DRAWN = "streets_seasons"
 REAL = {"grief_season": ("database", "queries"), "corridor": ("ref", "query")}  # data sets, and their folders
 
-LeftOut = tuple[str, str]  # what is left out, and why
+LeftOut = tuple[str, str]  # name of a data set or an evaluation, and why it is left out
 
 
 @dataclass(frozen=True)

@@ -18,7 +18,7 @@ from mfvpr.datasets.published import published_differences
 from mfvpr.report import Table
 
 BERLIN = ("berlin_a100", "berlin_kudamm", "berlin_halenseestrasse")
-OTHERS = ("gardens_point", "nordland_1415", "robotcar_seasons")
+SEPARATE = ("gardens_point", "nordland_1415", "robotcar_seasons")
 OVERALL = ""  # in place of a sequence: the only one, or the plain mean of several
 TOLERANCES, DEPTHS = (1, 2, 5), (1, 5, 10)  # of the printed recalls
 _NONE = "-"
@@ -68,7 +68,7 @@ def printed_tables() -> Mapping[str, Any]:
 def average(recalls: Mapping[str, Any]) -> Float[np.ndarray, " tolerances"]:
     """The paper's average of recalls by data set and tolerance: Berlin's three count as one data set."""
     berlin = np.mean([recalls[name] for name in BERLIN], axis=0)
-    return np.mean([berlin, *(recalls[name] for name in OTHERS)], axis=0)
+    return np.mean([berlin, *(recalls[name] for name in SEPARATE)], axis=0)
 
 
 @cache
@@ -108,11 +108,8 @@ def paper_tables(evaluations: Evaluations) -> Iterator[tuple[str, str, Table]]:
     """(name, heading, table) of each that is not empty; systems without numbers are left out."""
     yield "data_sets", f"Data sets (Table I){_BRACKETS}", _data_sets(evaluations)
     recall, depths = {}, {}  # columns: what they show
-    tables: dict[str, tuple[str, Any]] = {}
-    tables["recall"] = (
-        "Recall@1 in %, by data set and threshold (Tables III and VII)",
-        partial(_recalls, columns=recall),
-    )
+    heading = "Recall@1 in %, by data set and threshold (Tables III and VII)"
+    tables: dict[str, tuple[str, Any]] = {"recall": (heading, partial(_recalls, columns=recall))}
     for name, dataset in evaluations.datasets.items():
         title, thresholds = evaluations.title(name), evaluations.thresholds(name)
         recall |= {f"{title} ±{at:g}": (name, OVERALL, at, 1) for at in thresholds}
@@ -162,15 +159,15 @@ def _recalls(evaluations: Evaluations, row: Row, columns: Mapping[str, tuple[str
 def averaged_datasets(evaluations: Evaluations) -> list[str]:
     """The paper's six data sets, if all are here; else all with the paper's tolerances."""
     names = [name for name in evaluations.datasets if {*TOLERANCES} <= {*evaluations.thresholds(name)}]
-    is_papers = {*BERLIN, *OTHERS} <= {*names}
-    return [name for name in names if not is_papers or name in (*BERLIN, *OTHERS)]
+    is_papers = {*BERLIN, *SEPARATE} <= {*names}
+    return [name for name in names if not is_papers or name in (*BERLIN, *SEPARATE)]
 
 
 def _averages(evaluations: Evaluations, row: Row, names: Sequence[str]) -> Cells:
     """Means over data sets, of rows that have all of them, and the printed ones beside those of the paper's six."""
     keys = [[(row.name, name, OVERALL, at, 1) for at in TOLERANCES] for name in names]
     recalls = np.array([[evaluations.recalls.get(key, np.nan) for key in of_name] for of_name in keys])
-    is_papers, means, known = {*names} == {*BERLIN, *OTHERS}, [None] * 3, [None] * 3
+    is_papers, means, known = {*names} == {*BERLIN, *SEPARATE}, [None] * 3, [None] * 3
     if names and np.isfinite(recalls).all():
         means = average(dict(zip(names, recalls, strict=True))) if is_papers else recalls.mean(axis=0)
     if row.name in printed_tables()["recall"]:

@@ -42,10 +42,8 @@ class GridAnchors:
     def __post_init__(self) -> None:
         check_fields(self)
         if self.size > self.side or self.size % 2 == 0 or self.side * self.size > 2**12:
-            raise InputError(
-                f"patch={self.size}: expected an odd number of cells up to the side of {self.side}, with side * patch "
-                "up to 4096 (float32 holds no larger score exactly)"
-            )
+            limit = "side * patch up to 4096 (float32 holds no larger score exactly)"
+            raise InputError(f"patch={self.size}: expected an odd number up to the side of {self.side}, with {limit}")
 
     @property
     def size(self) -> int:
@@ -61,7 +59,7 @@ class GridAnchors:
         Matches without `index0` or `index1` raise an `InputError`.
         """
         if matches.index0 is None or matches.index1 is None:
-            raise InputError("GridAnchors: expected matches that know their keypoints (index0, index1), got none")
+            raise InputError("GridAnchors: expected matches with index0 and index1, got none; match all cells")
         real = match_confidence(matches) > 0
         cells = jnp.arange(self.side**2, dtype=jnp.int32)
         cell1, cell0 = (jnp.where(real, jnp.asarray(index, jnp.int32), 0) for index in (matches.index1, matches.index0))

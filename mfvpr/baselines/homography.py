@@ -31,13 +31,15 @@ _TRIANGLES = (0, 1, 2), (0, 1, 3), (0, 2, 3), (1, 2, 3)
 _FLAT = 1e-6  # area of a triangle, relative to its sides, that rounding can produce
 _STEPS = 10  # of the least squares, as in OpenCV
 _MIN_CURVATURE = 1e-9  # keeps the system solvable if the inliers do not determine a parameter
+_FAR = 1e15  # coordinate in a frame; errors of farther points may overflow, so that these are no inliers
 _EXACT = jax.lax.Precision.HIGHEST
 
 
 class Estimate(NamedTuple):
     """Result of RANSAC for one pair, after a number of samples."""
 
-    matrix: Float[Array, "3 3"]  # (x, y, 1) of the candidate -> query, px, last entry 1; NaN = no homography
+    # (x, y, 1) of the candidate -> query, px; NaN = no homography. Its last entry is 1, or 0 if (0, 0) is at infinity.
+    matrix: Float[Array, "3 3"]
     inliers: Bool[Array, " slots"]
     score: Float[Array, ""]
     samples: Int[Array, ""]
@@ -92,7 +94,9 @@ class Homography:
             return Estimate(jnp.full((3, 3), jnp.nan, points.dtype), real, jnp.sum(counts), jnp.zeros((), jnp.int32))
         require_sizes(matches.image_size0, matches.image_size1)
         frame = Frame.of(matches.image_size1, matches.image_size0, points.dtype)
-        normalized = masked(frame.normalize(points), real, jnp.nan)  # NaN is never an inlier
+        normalized = frame.normalize(points)
+        is_near = jnp.all(jnp.abs(normalized) < _FAR, axis=1)
+        normalized = masked(normalized, real & is_near, jnp.nan)  # NaN is never an inlier
         threshold = threshold / frame.scale[1]
         order = canonical_order(masked(points, real), real)
         number = jnp.sum(real, dtype=jnp.int32)
@@ -102,9 +106,7 @@ class Homography:
         each_counts_one = matches.confidence is None
         model, samples = _search(key, normalized[order], counts[order], number, *limits, each_counts_one)
         if self.refit:
-            model = least_squares(
-                model, masked(normalized, real), masked(counts, is_inlier(model, normalized, threshold))
-            )
+            model = least_squares(model, normalized, masked(counts, is_inlier(model, normalized, threshold)))
         inliers = jnp.where(number == 4, real, is_inlier(model, normalized, threshold))
         score = jnp.sum(masked(counts, inliers))
         few = jnp.sum(counts) if self.few == "count" else jnp.zeros_like(score)
@@ -226,17 +228,17 @@ def draw_four(key: Array, round_number: Int[Array, ""] | int, count: Int[Array, 
     """Four distinct numbers below `count` (at least 4), all sets equally likely."""
     bits = jax.random.bits(jax.random.fold_in(key, round_number), (4, _DRAWS), jnp.uint32)
     share = (bits >> 8).astype(jnp.float32) * 2.0**-24
-    remaining = count - jnp.arange(4, dtype=jnp.int32)  # numbers that are not taken yet
+    remaining = count - jnp.arange(4, dtype=jnp.int32)  # numbers that are not drawn yet
     place = jnp.minimum((share * remaining[:, None].astype(jnp.float32)).astype(jnp.int32), remaining[:, None] - 1)
     numbers: list[Array] = []
-    taken: list[Array] = []  # the same numbers, ascending
+    ascending: list[Array] = []  # the same numbers
     for drawn in place:
-        for other in taken:
-            drawn = drawn + (drawn >= other).astype(jnp.int32)
+        for smaller in ascending:
+            drawn = drawn + (drawn >= smaller).astype(jnp.int32)
         numbers.append(drawn)
-        for index, other in enumerate(taken):  # insert the number; what is larger moves on
-            taken[index], drawn = jnp.minimum(other, drawn), jnp.maximum(other, drawn)
-        taken.append(drawn)
+        for index, entry in enumerate(ascending):  # insert the drawn number; larger numbers move on
+            ascending[index], drawn = jnp.minimum(entry, drawn), jnp.maximum(entry, drawn)
+        ascending.append(drawn)
     return jnp.stack(numbers)
 
 
@@ -311,20 +313,21 @@ def through(four: Float[Array, "coordinates=4 matches=4 samples"]) -> Float[Arra
 
 
 def is_inlier(model: Array, points: Array, threshold: Array) -> Array:
-    """Whether H p1 is within the threshold of p0: models `[9, ...]` and a match `[4]`, or a model and matches."""
+    """Whether H p1 is finite and close to p0: models `[9, ...]` and a match `[4]`, or a model and matches."""
     x1, y1, x0, y0 = jnp.moveaxis(points, -1, 0)
     u, v, w = (model[row] * x1 + model[row + 1] * y1 + model[row + 2] for row in (0, 3, 6))
     u, v, limit = u - x0 * w, v - y0 * w, threshold * w  # both sides times the last coordinate of H p1
-    return u * u + v * v <= limit * limit
+    return (u * u + v * v <= limit * limit) & (w != 0)
 
 
 def least_squares(model: Float[Array, "9"], points: Float[Array, "slots 4"], weights: Array) -> Float[Array, "9"]:
-    """Model with the least weighted squared error for matches."""
-    x1, y1, x0, y0 = points.T
+    """Model with the least weighted squared error for matches; those of weight 0 may have any points."""
+    x1, y1, x0, y0 = masked(points, weights > 0).T  # an infinite error times 0 would be NaN
     plane, target, roots = jnp.stack([x1, y1, jnp.ones_like(x1)]), jnp.stack([x0, y0]), jnp.sqrt(weights)
 
     def errors_of(free: Float[Array, "8"]) -> Float[Array, " errors"]:
-        u, v, w = jnp.matmul(jnp.append(free, 1.0).reshape(3, 3), plane, precision=_EXACT)
+        u, v, w = jnp.matmul(jnp.append(free, last).reshape(3, 3), plane, precision=_EXACT)
+        w = jnp.where(weights > 0, w, 1.0)
         return ((jnp.stack([u, v]) / w[None] - target) * roots[None]).reshape(-1)
 
     def step(_: int, state: tuple[Array, Array]) -> tuple[Array, Array]:
@@ -336,8 +339,9 @@ def least_squares(model: Float[Array, "9"], points: Float[Array, "slots 4"], wei
         is_better = jnp.sum(errors_of(free - change) ** 2) < jnp.sum(errors**2)
         return jnp.where(is_better, free - change, free), damping * jnp.where(is_better, 0.1, 10.0)
 
-    start = model[:8] / model[8], jnp.asarray(1e-3, model.dtype)
-    return jnp.append(jax.lax.fori_loop(0, _STEPS, step, start)[0], 1.0)
+    last = jnp.where(model[8] == 0, 0.0, 1.0)  # 0 = the center of the candidate has its image at infinity
+    start = model[:8] / jnp.where(model[8] == 0, 1.0, model[8]), jnp.asarray(1e-3, model.dtype)
+    return jnp.append(jax.lax.fori_loop(0, _STEPS, step, start)[0], last)
 
 
 class Frame(NamedTuple):
@@ -358,13 +362,13 @@ class Frame(NamedTuple):
         return (points - self.center[None]) / jnp.repeat(self.scale, 2)[None]
 
     def to_pixels(self, model: Float[Array, "9"]) -> Float[Array, "3 3"]:
-        """Matrix in px, last entry 1, of a model in the coordinates of the frame."""
+        """Matrix in px of a model in the coordinates of the frame; the last entry is 1, or 0."""
         (x1, y1, x0, y0), (scale1, scale0) = self.center, self.scale
         zero, unit = jnp.zeros_like(x1), jnp.ones_like(x1)
         enter = jnp.stack([unit, zero, -x1, zero, unit, -y1, zero, zero, scale1]).reshape(3, 3)
         leave = jnp.stack([scale0, zero, x0, zero, scale0, y0, zero, zero, unit]).reshape(3, 3)
         matrix = jnp.matmul(jnp.matmul(leave, model.reshape(3, 3), precision=_EXACT), enter, precision=_EXACT)
-        return matrix / matrix[2, 2]
+        return matrix / jnp.where(matrix[2, 2] == 0, 1.0, matrix[2, 2])
 
 
 @value

@@ -165,12 +165,12 @@ def read_weight(path: Path | str) -> tuple[LearnedWeight, dict[str, Any]]:
         inputs, hidden = len(names), arrays["output"].size
         shapes = [(inputs,), (inputs,), (inputs, hidden), (hidden,), (hidden,), ()]
         if content["format"] != _FORMAT or not {*names} <= {*INPUTS} or [a.shape for a in arrays.values()] != shapes:
-            raise ValueError("another format")
+            raise ValueError("it has another format")
         if not all(jnp.isfinite(each).all() for each in arrays.values()) or not (arrays["scale"] > 0).all():
-            raise ValueError("numbers that make no weight")
+            raise ValueError("its numbers are not finite, or a scale is not above 0")
         return LearnedWeight(**arrays, names=names), dict(content["made"])
     except (OSError, ValueError, LookupError, TypeError) as error:
-        raise InputError(f"{path}: expected a match weight that mfvpr learn wrote ({error})") from error
+        raise InputError(f"{path}: expected a match weight of mfvpr learn ({error}); learn it again") from error
 
 
 def named_weight(weight: Weight | str) -> Weight:

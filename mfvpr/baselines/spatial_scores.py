@@ -67,7 +67,7 @@ class RapidSpatialScore:
 def query_features(matches: Matches) -> Float[jax.Array, ""]:
     """Number of the query's keypoints, at least 1, float32: divisor of scores per feature."""
     if matches.count0 is None:
-        raise InputError("per_feature=True: expected matches with the query's number of keypoints (count0), got None")
+        raise InputError("per_feature=True: expected matches with count0 (query's keypoints), got None; leave it out")
     return jnp.maximum(jnp.asarray(matches.count0, jnp.float32), 1.0)
 
 

@@ -30,24 +30,27 @@ def read_checkpoint(path: Path | str) -> dict[str, np.ndarray]:
         file.seek(0)
         for magic, read in _READERS.items():
             if start.startswith(magic):
-                return read(file)
+                return _require_tensors(read(file))
         kind = "an empty or text file, perhaps a web page" if start.isascii() else "another file"
         raise InputError(f"expected a checkpoint of torch, NumPy or MATLAB, got {kind}; download it again")
+
+
+def _require_tensors(content: Any) -> dict[str, np.ndarray]:
+    """Return the content of a file, or raise an InputError unless it is numbers by name."""
+    if not isinstance(content, dict) or not content:
+        got = "none" if content == {} else type(content).__name__
+        raise InputError(f"expected tensors by name, got {got}; use the official file")
+    for key, tensor in content.items():
+        if not isinstance(key, str) or not isinstance(tensor, np.ndarray) or tensor.dtype.kind not in "fiub":
+            got = f"{type(tensor).__name__} at {shorten(str(key))}"
+            raise InputError(f"expected tensors by name, got {got}; use the official file")
+    return dict(content)
 
 
 def _read_layers(file: BinaryIO) -> dict[str, np.ndarray]:
     """Read a .npy file with a pickled dictionary of layers."""
     [layers] = read_objects(file, "a dictionary of layers")
-    arrays = {}
-    for layer, parts in layers.items():
-        for name, array in parts.items():
-            key = f"{layer}.{name}"
-            if not isinstance(array, np.ndarray) or array.dtype.kind not in "fiub":
-                raise InputError(f"expected arrays by layer, got {type(array).__name__} at {shorten(key)}")
-            arrays[key] = array
-    if not arrays:
-        raise InputError("expected a dictionary of layers, got none; use the official file")
-    return arrays
+    return {f"{layer}.{name}": array for layer, parts in layers.items() for name, array in parts.items()}
 
 
 _WRAPPERS = ("model", "state_dict", "model_state_dict")
@@ -91,7 +94,7 @@ class _TensorUnpickler(DataUnpickler):
         match pid:
             case ("storage", str(code), str(key), _, int(count), *rest) if rest in ([], [None]):
                 return self.storages.setdefault(key, np.empty(count, code))
-        raise InputError("expected plain dense tensors, got others; use the official file")
+        raise InputError("expected plain dense tensors, got another kind; use the official file")
 
 
 def _read_zip(file: BinaryIO) -> dict[str, np.ndarray]:
@@ -100,8 +103,8 @@ def _read_zip(file: BinaryIO) -> dict[str, np.ndarray]:
         has_order = f"{folder}byteorder" in archive.namelist()
         order = archive.read(f"{folder}byteorder").decode() if has_order else "little"
         unpickler = _TensorUnpickler(content)
-        tensors = unpickler.load()
-        return _tensors(tensors, unpickler.storages, order, lambda key: archive.read(f"{folder}data/{key}"))
+        read_values = lambda key: archive.read(f"{folder}data/{key}")  # noqa: E731
+        return _tensors(unpickler.load(), unpickler.storages, order, read_values)
 
 
 def _read_legacy(file: BinaryIO) -> dict[str, np.ndarray]:
@@ -118,21 +121,14 @@ def _read_legacy(file: BinaryIO) -> dict[str, np.ndarray]:
     return _tensors(content, unpickler.storages, order, values.__getitem__)
 
 
-def _tensors(
-    content: Any, storages: Mapping[str, np.ndarray], order: str, read_values: Callable[[str], bytes]
-) -> dict[str, np.ndarray]:
+def _tensors(content: Any, storages: Mapping[str, np.ndarray], order: str, read_values: Callable[[str], bytes]) -> Any:
     """Tensors in a pickle's content, after the values of their storages, in this byte order, were read."""
     for key, storage in storages.items():
         dtype = storage.dtype.newbyteorder(order)  # pyright: ignore[reportArgumentType]
         storage[:] = np.frombuffer(read_values(key), dtype, len(storage))
     if isinstance(content, dict):
-        content = next((content[key] for key in _WRAPPERS if isinstance(content.get(key), dict)), content)
-    if not isinstance(content, dict) or not content:
-        raise InputError(f"expected tensors by name, got {type(content).__name__}; use the official file")
-    for key, tensor in content.items():
-        if not isinstance(key, str) or not isinstance(tensor, np.ndarray):
-            raise InputError(f"expected tensors by name, got {type(tensor).__name__} at {shorten(str(key))}")
-    return dict(content)
+        return next((content[key] for key in _WRAPPERS if isinstance(content.get(key), dict)), content)
+    return content
 
 
 # First bytes of a file -> reader; every binary pickle begins with the last ones.

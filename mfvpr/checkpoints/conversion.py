@@ -17,7 +17,7 @@ from mfvpr.utils.errors import InputError
 UPSAMPLING = (2, 3, 0, 1)  # a transposed convolution's IOHW -> HWIO
 LINEAR = (1, 0)  # (out, in) -> (in, out), also of 1 x 1 convolutions
 _OF_KERNELS = {4: (2, 3, 1, 0), 2: LINEAR}  # by the number of our axes; OIHW -> HWIO
-_PARAMETERS = {  # theirs -> ours, the first one that the module has
+_PARAMETERS = {  # name in the checkpoint -> in our modules, the first one that the module has
     "weight": ("kernel", "scale"),
     "weights": ("kernel",),
     "bias": ("bias",),
@@ -47,7 +47,7 @@ class Table:
     def path_of(self, key: str, paths: Collection[str]) -> str:
         """The one of these paths that a key of the checkpoint sets; "" if there is none."""
         module, _, name = key.rpartition(".")
-        forms = [(key, ""), *((module, f".{ours}") for ours in _PARAMETERS.get(name, ()))]
+        forms = [(key, ""), *((module, f".{parameter}") for parameter in _PARAMETERS.get(name, ()))]
         for pattern, target in self.names.items():
             for form, ending in forms:
                 if (match := re.fullmatch(pattern, form)) and (path := match.expand(target) + ending) in paths:
@@ -133,9 +133,9 @@ def _resnet(source: str, numbers: Sequence[int]) -> dict[str, str]:
     """Layers by their numbers in the file."""
     names = {}
     for layer, number in enumerate(numbers, 1):
-        block, ours = rf"{source}{number}\.(\d)", rf"backbone.layer{layer}.\1"
-        names[rf"{block}\.((?:conv|bn)\d)"] = rf"{ours}.\2"
-        names |= {rf"{block}\.downsample\.0": f"{ours}.shortcut", rf"{block}\.downsample\.1": f"{ours}.shortcut_bn"}
+        block, path = rf"{source}{number}\.(\d)", rf"backbone.layer{layer}.\1"
+        names[rf"{block}\.((?:conv|bn)\d)"] = rf"{path}.\2"
+        names |= {rf"{block}\.downsample\.0": f"{path}.shortcut", rf"{block}\.downsample\.1": f"{path}.shortcut_bn"}
     return names
 
 
@@ -166,8 +166,7 @@ EFFICIENTNET = Table(
 
 ALIKED = Table(
     {
-        r"(block\d\.conv\d|conv\d)": r"\1",
-        r"(block\d\.conv\d)\.regular_conv": r"\1",  # the deformable convolution's
+        r"(block\d\.conv\d|conv\d)(?:\.regular_conv)?": r"\1",  # regular_conv in deformable convolutions
         r"(block\d\.conv\d)\.offset_conv": r"\1.offset",
         r"(block\d\.bn\d)": r"\1",
         r"(block\d)\.downsample": r"\1.shortcut",
@@ -183,7 +182,7 @@ ALIKED = Table(
 def _attention(source: str, target: str, parts: dict[str, str]) -> dict[str, str]:
     layer = rf"(?:transformers\.(\d)\.{source}_attn|{source}_attn\.(\d))"  # the second form in older files
     parts = parts | {r"ffn\.0": "hidden", r"ffn\.1": "norm", r"ffn\.3": "update"}
-    return {rf"{layer}\.{theirs}": rf"layers.\1\2.{target}.{ours}" for theirs, ours in parts.items()}
+    return {rf"{layer}\.{key}": rf"layers.\1\2.{target}.{path}" for key, path in parts.items()}
 
 
 LIGHTGLUE = Table(
@@ -236,18 +235,18 @@ GEM_RESNET50 = Table(
 
 
 def _transformer(source: str, target: str) -> dict[str, str]:
-    block, ours = rf"{source}blocks\.(\d+)", rf"{target}blocks.\1"
+    block, path = rf"{source}blocks\.(\d+)", rf"{target}blocks.\1"
     return {
         rf"{source}cls_token": f"{target}first",
         rf"{source}pos_embed": f"{target}positions",
         rf"{source}register_tokens": f"{target}registers",
         rf"{source}patch_embed\.proj": f"{target}patches",
-        rf"{block}\.attn\.qkv": f"{ours}.attention.qkv",
-        rf"{block}\.attn\.proj": f"{ours}.attention.output",
-        rf"{block}\.mlp\.fc1": f"{ours}.perceptron.hidden",
-        rf"{block}\.mlp\.fc2": f"{ours}.perceptron.output",
-        rf"{block}\.ls(\d)\.gamma": rf"{ours}.scale\2",
-        rf"{block}\.norm(\d)": rf"{ours}.norm\2",
+        rf"{block}\.attn\.qkv": f"{path}.attention.qkv",
+        rf"{block}\.attn\.proj": f"{path}.attention.output",
+        rf"{block}\.mlp\.fc1": f"{path}.perceptron.hidden",
+        rf"{block}\.mlp\.fc2": f"{path}.perceptron.output",
+        rf"{block}\.ls(\d)\.gamma": rf"{path}.scale\2",
+        rf"{block}\.norm(\d)": rf"{path}.norm\2",
         rf"{source}norm": f"{target}norm",
     }
 

@@ -13,7 +13,7 @@ import safetensors.numpy
 
 from mfvpr.checkpoints.checkpoint import read_checkpoint
 from mfvpr.checkpoints.conversion import RUNTIME, convert
-from mfvpr.checkpoints.networks import NETWORKS, OWN, Entry, blueprint, entry_of, how_to_install, own_entry
+from mfvpr.checkpoints.networks import CUSTOM_PREFIX, Entry, custom_entry, entry_of, how_to_install, plan_network
 from mfvpr.io.containers import reading
 from mfvpr.utils.errors import InputError
 from mfvpr.utils.files import replacing, require_file
@@ -33,34 +33,33 @@ def weights_folder() -> Path:
     return Path(os.path.expanduser(os.environ.get("MFVPR_WEIGHTS") or "~/.cache/mfvpr/weights"))
 
 
-def install(checkpoint: Path, name: str, *, own: str | None = None) -> Path:
+def install(checkpoint: Path, name: str, *, custom_name: str | None = None) -> Path:
     """Convert a checkpoint to a runtime file; the checkpoint does not change.
 
     Args:
         checkpoint: the official file, or one with its keys and shapes; a runtime file if the weights are your own.
         name: of the published weights.
-        own: name of weights of your own, for the network of `name`. They are installed as `own/<name>`.
+        custom_name: of weights of your own, for the network of `name`. They are installed as `own/<custom_name>`.
 
     Raises:
         InputError: the name is unknown, or the file is no checkpoint, not the published one, or of another network.
     """
-    entry, table = entry_of(name), NETWORKS[name].table
-    mend = f"use the official {entry.file}"
-    if own is not None:
-        entry = own_entry(f"{OWN}{own}", name)
+    entry = entry_of(name)
+    if custom_name is not None:
+        entry = custom_entry(f"{CUSTOM_PREFIX}{custom_name}", name)
         if is_installed(entry):
-            raise InputError(f"{entry.name}: expected a name that is free, got one of installed weights")
+            raise InputError(f"{entry.name}: expected a name that is free, got installed weights; choose another")
     sha256 = check_sha256(checkpoint, entry, checkpoint)
-    if own is not None and checkpoint.suffix == ".safetensors":
+    if custom_name is not None and checkpoint.suffix == ".safetensors":
         with reading(checkpoint, "a safetensors file"):
             table, tensors = RUNTIME, _read(checkpoint)[1]
     else:
-        tensors = read_checkpoint(checkpoint)
-    plan = blueprint(entry)
+        table, tensors = entry.table, read_checkpoint(checkpoint)
+    plan = plan_network(entry.builder())
     try:
         arrays = convert(tensors, table, plan.shapes)
     except InputError as error:
-        raise InputError(f"{checkpoint}: {error}; {mend}") from error
+        raise InputError(f"{checkpoint}: {error}; use the official {entry_of(name).file}") from error
     return save(entry, arrays, checkpoint, parameters=plan.parameters, sha256=sha256)
 
 
@@ -112,7 +111,7 @@ def load_model(name: str) -> "nnx.Module":
     """
     entry, arrays = installed_entry(name), load(name)
     try:
-        return blueprint(entry).build(arrays)
+        return plan_network(entry.builder()).build(arrays)
     except InputError as error:  # the file comes from another version of the network
         raise _error(entry, str(error)) from error
 
@@ -136,16 +135,16 @@ def read_provenance(name: str) -> dict[str, Any]:
 
 def installed_entry(name: str) -> Entry:
     """`entry_of`, also for installed weights of your own (`own/<name>`)."""
-    own = {entry.name: entry for entry in own_entries()} if name.startswith(OWN) else {}
-    return own.get(name) or entry_of(name)
+    entries = custom_entries() if name.startswith(CUSTOM_PREFIX) else []
+    return next((entry for entry in entries if entry.name == name), None) or entry_of(name)
 
 
-def own_entries() -> list[Entry]:
+def custom_entries() -> list[Entry]:
     """Entries of the weights of your own that are installed."""
     entries = []
-    for path in sorted(weights_folder().glob(f"{OWN}*.safetensors")):
+    for path in sorted(weights_folder().glob(f"{CUSTOM_PREFIX}*.safetensors")):
         with suppress(safetensors.SafetensorError, ValueError, LookupError):  # damaged: not installed
-            entries.append(own_entry(f"{OWN}{path.stem}", _read(path, with_arrays=False)[0]["like"]))
+            entries.append(custom_entry(f"{CUSTOM_PREFIX}{path.stem}", _read(path, with_arrays=False)[0]["like"]))
     return entries
 
 

@@ -18,7 +18,7 @@ from mfvpr.utils.errors import InputError
 if TYPE_CHECKING:
     from flax import nnx
 
-OWN = "own/"  # names of weights of one's own begin with it, also in settings and run folders
+CUSTOM_PREFIX = "own/"  # names of weights of one's own begin with it, also in settings and run folders
 
 
 @dataclass(frozen=True)
@@ -33,6 +33,8 @@ class Entry:
     sha256: str | None  # None where not published
     code_license: str
     weights_license: str
+    builder: Callable[[], Callable[..., "nnx.Module"]]  # imports the network, untraced; returns its constructor
+    table: Table  # of the network's published checkpoints
     like: str | None = None  # weights of one's own: the published entry of the same network
 
     @property
@@ -41,22 +43,16 @@ class Entry:
         return f"code {self.code_license}, weights {self.weights_license}"
 
 
-class Network(NamedTuple):
-    """A network of the package, and the table of its published checkpoints."""
-
-    builder: Callable[[], Callable[..., "nnx.Module"]]  # imports the model, untraced; returns its constructor
-    table: Table
-
-
 REGISTRY: dict[str, Entry] = {}  # by name
-NETWORKS: dict[str, Network] = {}  # by the same names
-_LICENSES = {  # network -> of the code and of the weights
+_DRIVE = "https://drive.google.com/file/d/{}/view"
+_LICENSES = {  # network, or name of weights -> of the code and of the weights
     "d2net": ("BSD-3-Clause-Clear", "none stated"),
     "mixvpr": ("none stated", "none stated"),
     "aliked": ("BSD-3-Clause", "BSD-3-Clause"),
     "lightglue": ("Apache-2.0", "Apache-2.0"),
     "ssm": ("MIT (SSM-VPR)", "CC BY (Places365)"),
     "netvlad": ("MIT", "MIT"),
+    "netvlad_pytorch": ("none stated", "none stated"),
     "patch_netvlad": ("MIT", "MIT"),
     "gem": ("MIT", "MIT"),
     "dinov2": ("Apache-2.0", "Apache-2.0"),
@@ -75,7 +71,6 @@ def _publish(
     file: str = "",
     size: int | None = None,
     sha256: str | None = None,
-    licenses: tuple[str, str] | None = None,
     **options: Any,
 ) -> None:
     """Register a file, and the class of `mfvpr.networks` with these arguments; the source ends with the file."""
@@ -85,15 +80,12 @@ def _publish(
 
         return partial(getattr(networks, model), *arguments, **options)
 
-    file, licenses = file or source.rpartition("/")[2], licenses or _LICENSES[network]
-    REGISTRY[name] = Entry(name, network, file, source, size, sha256, *licenses)
-    NETWORKS[name] = Network(builder, table)
+    file, licenses = file or source.rpartition("/")[2], _LICENSES.get(name) or _LICENSES[network]
+    REGISTRY[name] = Entry(name, network, file, source, size, sha256, *licenses, builder, table)
 
 
 for _name in ("d2_tf", "d2_ots", "d2_tf_no_phototourism"):
     _publish("d2net", _name, f"https://dusmanu.com/files/d2-net/{_name}.pth", conversion.D2NET, "D2Net")
-
-_DRIVE = "https://drive.google.com/file/d/{}/view"
 
 for _channels, _rows, _id in (
     (1024, 4, "1vuz3PvnR7vxnDDLQrdHJaOA04SQrtk5L"),
@@ -124,8 +116,7 @@ for _name, _file in (("netvlad_pitts30k", "Pitts30K_struct.mat"), ("netvlad_toky
     _source = f"https://cvg-data.inf.ethz.ch/hloc/netvlad/{_file}"
     _publish("netvlad", _name, _source, conversion.NETVLAD_MATLAB, "VggNetVlad", 64, 4096, original=True)
 _source = "vgg16_netvlad_checkpoint.zip at https://drive.google.com/open?id=17luTjZFCX639guSVy00OUtzfTQo4AMF2"
-_about = {"file": "checkpoint.pth.tar", "licenses": ("none stated", "none stated")}
-_publish("netvlad", "netvlad_pytorch", _source, conversion.NETVLAD, "VggNetVlad", 64, None, **_about)
+_publish("netvlad", "netvlad_pytorch", _source, conversion.NETVLAD, "VggNetVlad", 64, None, file="checkpoint.pth.tar")
 
 for _backbone, _outputs, _table in (
     ("VGG16", 512, conversion.GEM_VGG16),
@@ -167,10 +158,10 @@ for _name, _id, _file, _registers in (
     _publish("selavpr", _name, _source, conversion.SELAVPR, "SelaVpr", registers=_registers, file=_file)
 
 
-def own_entry(name: str, like: str) -> Entry:
+def custom_entry(name: str, like: str) -> Entry:
     """Entry of weights of one's own, for the network of the published weights `like`."""
-    if not re.fullmatch(rf"{OWN}[\w-]+", name):
-        raise InputError(f"{name.removeprefix(OWN)}: expected a name of letters, digits, - and _")
+    if not re.fullmatch(rf"{CUSTOM_PREFIX}[\w-]+", name):
+        raise InputError(f"{name}: expected a name of letters, digits, - and _ after {CUSTOM_PREFIX}; choose another")
     none = {"source": "-", "size": None, "sha256": None, "code_license": "-", "weights_license": "-"}
     return replace(entry_of(like), name=name, file="FILE", like=like, **none)
 
@@ -178,7 +169,7 @@ def own_entry(name: str, like: str) -> Entry:
 def how_to_install(entry: Entry) -> str:
     """The first command that installs the weights of an entry."""
     if entry.like is not None:
-        return f"mfvpr weights add FILE --own {entry.name.removeprefix(OWN)} --as {entry.like}"
+        return f"mfvpr weights add FILE --own {entry.name.removeprefix(CUSTOM_PREFIX)} --as {entry.like}"
     command = f"add {shlex.quote(entry.file)}" if entry.sha256 is None else f"download {entry.name}"
     return f"mfvpr weights {command}"
 
@@ -189,11 +180,11 @@ def entry_of(name: str) -> Entry:
         return REGISTRY[name]
     nearest = difflib.get_close_matches(name, REGISTRY, n=1)
     hint = f"the nearest is {nearest[0]}" if nearest else "see mfvpr weights list"
-    raise InputError(f"{name}: no weights of this name; {hint}")
+    raise InputError(f"{name}: expected the name of published weights; {hint}")
 
 
 class Blueprint(NamedTuple):
-    """A network without values, made without computing any."""
+    """A network without values, planned without computing any."""
 
     shapes: Mapping[str, tuple[int, ...]]  # by dotted path; parameters and running statistics
     parameters: int  # without running statistics
@@ -212,13 +203,8 @@ class Blueprint(NamedTuple):
         return module
 
 
-def blueprint(entry: Entry) -> Blueprint:
-    """Blueprint of the entry's network."""
-    return plan_network(NETWORKS[entry.like or entry.name].builder())
-
-
 def plan_network(build: Callable[..., "nnx.Module"]) -> Blueprint:
-    """Blueprint of the network that `build(rngs=...)` makes."""
+    """Blueprint of the network that `build(rngs=...)` returns."""
     import jax
     from flax import nnx
 

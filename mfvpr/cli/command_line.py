@@ -85,8 +85,7 @@ def _set_up_jax(compiled: bool) -> None:
         jax.devices()
     except (RuntimeError, AssertionError) as error:  # the latter for `cuda` without its plugin
         platforms, reason = os.environ.get("JAX_PLATFORMS"), " ".join(str(error).splitlines()[:1])
-        words = f"expected a device that JAX can use, such as JAX_PLATFORMS=cpu, got: {reason}"
-        raise InputError(f"JAX_PLATFORMS={platforms}: {words}") from error
+        raise InputError(f"JAX_PLATFORMS={platforms}: expected a device of JAX, such as cpu, got: {reason}") from error
 
 
 def checked(program: str, composed: DictConfig) -> Any:
@@ -180,8 +179,7 @@ def aliked_or_sift() -> str:
     """The features of system=steering: ALIKED if its weights are installed, otherwise SIFT, with a warning."""
     if is_installed(entry_of("aliked-n16")):
         return "aliked"
-    remedy = "mfvpr weights download aliked-n16"
-    warnings.warn(f"system=steering uses SIFT, because ALIKED's weights are not installed; see: {remedy}", stacklevel=2)
+    warnings.warn("system=steering uses SIFT without ALIKED's weights: mfvpr weights download aliked-n16", stacklevel=2)
     return "sift"
 
 

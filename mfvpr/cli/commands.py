@@ -13,14 +13,14 @@ from urllib.request import urlopen
 import numpy as np
 import yaml
 
-from mfvpr.checkpoints import REGISTRY, entry_of, install, is_installed, load_model, own_entries, weights_folder
+from mfvpr.checkpoints import REGISTRY, custom_entries, entry_of, install, is_installed, load_model, weights_folder
 from mfvpr.checkpoints.files import check_sha256, file_sha256, installed_entry, read_provenance
 from mfvpr.checkpoints.networks import how_to_install
 from mfvpr.cli.command_line import compose_data_sets
 from mfvpr.cli.console import progress, refuse, track
 from mfvpr.cli.jobs import dataset_of
 from mfvpr.datasets import ImageFolder, image_folder
-from mfvpr.datasets.contents import own_rows
+from mfvpr.datasets.contents import identical_rows
 from mfvpr.datasets.ground_truth import middle, threshold_words
 from mfvpr.datasets.published import PUBLISHED, published_differences
 from mfvpr.io import read_stamps, stamps_in_names
@@ -51,7 +51,7 @@ def list_weights() -> None:
     """Print all checkpoints with licenses and whether they are installed."""
     header = ["name", "network", "official file", "license of code", "of weights", "installed", "MB"]
     rows = []
-    for entry in (*REGISTRY.values(), *own_entries()):
+    for entry in (*REGISTRY.values(), *custom_entries()):
         installed, size = "yes" if is_installed(entry) else "no", f"{entry.size / 1e6:.1f}" if entry.size else "-"
         file = f"yours, as {entry.like}" if entry.like else entry.file
         rows.append([entry.name, entry.network, file, entry.code_license, entry.weights_license, installed, size])
@@ -69,7 +69,7 @@ def add_weights(file: Path, *, as_: str | None = None, own: str | None = None) -
         expected = f"an official file name; say what it is with --as NAME, one of {', '.join(REGISTRY)}"
         raise InputError(f"{file}: expected {expected}" if file.exists() else f"{file}: no such file")
     entry = entry_of(as_ or official[file.name])
-    path = install(file, entry.name, own=own)
+    path = install(file, entry.name, custom_name=own)
     about = read_provenance(entry.name if own is None else f"own/{own}")
     origin = "" if entry.sha256 else f", from a file of sha256 {about['source_sha256'][:12]}..., which nobody published"
     origin = origin if own is None else f", your own for the network of {entry.name}; use it as weights={about['name']}"
@@ -78,7 +78,7 @@ def add_weights(file: Path, *, as_: str | None = None, own: str | None = None) -
 
 def verify_weights(names: Sequence[str] = ()) -> None:
     """Check the hashes of installed files, and that they fit their networks; by default all that is there."""
-    known = filter(is_installed, (*REGISTRY.values(), *own_entries()))
+    known = filter(is_installed, (*REGISTRY.values(), *custom_entries()))
     entries = [installed_entry(name) for name in names] or [*known]
     if not entries:
         print(f"nothing is installed in {weights_folder()}")
@@ -166,7 +166,7 @@ def check_data_set(name: str, settings: Sequence[str] = (), *, sheet: Path | Non
             extent = f"{counts.min()} to {counts.max()}, median {np.median(counts):g}"
             none = f"{(counts == 0).sum():,} queries have none"
             print(f"{sequence.name}: correct images of a query{within}: {extent}; {none}")
-        if num_same := sum(map(bool, own_rows(contents(sequence.images), database))):
+        if num_same := sum(map(bool, identical_rows(contents(sequence.images), database))):
             print(f"{sequence.name}: {num_same:,} queries are images of the database")
     target = sheet or Path(f"{dataset.name}.png")
     contact_sheet(target, dataset)

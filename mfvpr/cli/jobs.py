@@ -13,7 +13,7 @@ from mfvpr.cli.console import tell, track, warn
 from mfvpr.cli.schema import Common, RecallSettings
 from mfvpr.core.types import Shortlist
 from mfvpr.datasets import Dataset, IndexFile, LabelFiles
-from mfvpr.datasets.contents import Contents, fingerprints, own_rows
+from mfvpr.datasets.contents import Contents, fingerprints, identical_rows
 from mfvpr.datasets.ground_truth import CHOICES, threshold_words
 from mfvpr.datasets.published import published_dataset, published_differences
 from mfvpr.datasets.streets import CONDITIONS, TRUTH, streets_folder
@@ -90,7 +90,7 @@ def prepare(settings: Job, watch: Stopwatch) -> Inputs[Job]:
             side = f"query {sequence.name}" if len(dataset.sequences) > 1 else "query"
             contents[side] = cache.recipes.contents(sequence.images)
             if neighbors is not None:
-                same_images = own_rows(contents[side], contents["database"])
+                same_images = identical_rows(contents[side], contents["database"])
                 sequence = sequence.without_neighbors(len(dataset.database), same_images, neighbors)
             sequences.append(sequence)
         dataset = replace(dataset, sequences=tuple(sequences))
@@ -180,7 +180,7 @@ def _warn_of_data(dataset: Dataset, contents: Mapping[str, Contents], thresholds
     for difference in published_differences(dataset):
         warn(f"{dataset.name}: {difference}; its numbers are not comparable")
     for sequence, images in zip(dataset.sequences, [*contents.values()][1:], strict=True):
-        same = sum(map(bool, own_rows(images, contents["database"])))
+        same = sum(map(bool, identical_rows(images, contents["database"])))
         if same and sequence.excluded is None:
             images_of = f"{same} of {len(sequence.images)} queries are database images"
             warn(f"{images_of}: each finds itself; set dataset.exclude_neighbors=N, the frames to leave out around it")
@@ -228,10 +228,10 @@ def _warn_of_settings(settings: Common, dataset: Dataset, contents: Mapping[str,
 # --- the run folder ----------------------------------------------------------------------------------------------
 
 
-def claim(out: str | None, dataset: str, *, own: bool = False) -> AbstractContextManager[Path]:
+def claim(out: str | None, dataset: str, *, is_exclusive: bool = False) -> AbstractContextManager[Path]:
     """The run folder `out`, for this run alone, see `claim_run_folder`; None = a new one of a data set."""
     folder = expand_user(out) if out else Path("runs", dataset, f"{datetime.now():%Y-%m-%d_%H-%M-%S}")
-    return runs.claim_run_folder(folder, numbered=not out, own=own)
+    return runs.claim_run_folder(folder, numbered=not out, is_exclusive=is_exclusive)
 
 
 def write_results(

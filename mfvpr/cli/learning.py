@@ -15,7 +15,7 @@ from mfvpr.cli.console import warn
 from mfvpr.cli.jobs import Inputs, prepare, score_in_words, truth_in_words
 from mfvpr.cli.schema import Learn
 from mfvpr.cli.sweeping import axes_of
-from mfvpr.datasets.contents import own_rows
+from mfvpr.datasets.contents import identical_rows
 from mfvpr.evaluation.dataset_ranking import matches_recipe
 from mfvpr.matchers import Scales
 from mfvpr.report import runs, searches
@@ -122,13 +122,13 @@ def require_disjoint(teach: list[Prepared], report: list[Prepared]) -> None:
     """Raise an InputError for reports on images that were learned on, and for queries that would count twice."""
     for first, second in itertools.product(teach, report):
         sides = itertools.product(second.inputs.contents.values(), first.inputs.contents.values())
-        if same := sum(bool(rows) for pair in sides for rows in own_rows(*pair)):
+        if same := sum(bool(rows) for pair in sides for rows in identical_rows(*pair)):
             raise InputError(f"report={second.part.name}: expected no images of {first.part.name}; {same} are the same")
     for first, second in (*itertools.combinations(teach, 2), *itertools.combinations(report, 2)):
-        if same := sum(map(bool, own_rows(second.inputs.contents["query"], first.inputs.contents["query"]))):
+        if same := sum(map(bool, identical_rows(second.inputs.contents["query"], first.inputs.contents["query"]))):
             raise InputError(f"{second.part.name}: expected no queries of {first.part.name}; {same} would count twice")
     for first, second in itertools.combinations(report, 2):
-        if any(own_rows(second.inputs.contents["database"], first.inputs.contents["database"])):
+        if any(identical_rows(second.inputs.contents["database"], first.inputs.contents["database"])):
             warn(f"{first.part.name} and {second.part.name} are of one map: intervals and p are too small")
 
 

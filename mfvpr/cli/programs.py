@@ -104,7 +104,7 @@ def run_command(prog: str, description: str, add_arguments: Callable[[Parser], N
     """Parse the command line, and call the job `package.module:function` that is the parser's default `run`."""
     with one_line():
         _prepare_process()
-        parser = Parser(prog=prog, description=description)
+        parser = Parser(prog=prog, description=description, formatter_class=argparse.RawDescriptionHelpFormatter)
         parser.add_argument("--version", action="version", version=version(), help="print it and exit")
         add_arguments(parser)
         arguments: dict[str, Any] = vars(parser.parse_args())

@@ -228,9 +228,9 @@ class Localize(Resources):
 class Paper(Shared):
     """The paper's evaluation."""
 
-    data: str | None = setting(None, PATH | None, "folder of data sets; null = the drawn one alone")
-    datasets: list[str] | None = setting(None, list_of(TEXT) | None, "of these; null = all that are there")
-    systems: list[str] | None = setting(None, list_of(TEXT) | None, "null = all whose weights are there")
+    data: str | None = setting(None, PATH | None, "folder of data sets; null = the synthetic one alone")
+    datasets: list[str] | None = setting(None, list_of(TEXT) | None, "null = all in `data`, and the synthetic one")
+    systems: list[str] | None = setting(None, list_of(TEXT) | None, "names; null = all with installed weights")
     out: str = setting("runs/paper", PATH)
 
     __post_init__ = check_fields

@@ -44,10 +44,8 @@ def recall_at_k(
     """
     order = np.asarray(as_array(order))
     if order.ndim != 2:
-        raise InputError(
-            f"order: expected database rows [Q, C], best first, got {list(order.shape)}; count each ranking of several "
-            "by itself"
-        )
+        got = f"{list(order.shape)}; count each ranking of several by itself"
+        raise InputError(f"order: expected database rows [Q, C], best first, got {got}")
     if min(ks, default=1) < 1:
         raise InputError(f"ks: expected depths from 1, got {min(ks)}")
     sets = positives if isinstance(positives, Positives) else _Matrix(np.asarray(as_array(positives), bool))

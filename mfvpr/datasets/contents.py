@@ -16,7 +16,7 @@ from functools import cached_property
 from pathlib import Path, PurePath
 from typing import Any
 
-from mfvpr.datasets.datasets import ImageFolder, OwnRows
+from mfvpr.datasets.datasets import IdenticalRows, ImageFolder
 from mfvpr.datasets.image_reading import largest_16bit
 from mfvpr.utils.files import IMAGE_SUFFIXES, write_text
 from mfvpr.utils.runtime import ordered_map
@@ -94,7 +94,7 @@ def fingerprints(contents: Mapping[str, Contents]) -> dict[str, str]:
     return {side: folder.fingerprint for side, folder in contents.items()}
 
 
-def own_rows(queries: Contents, database: Contents) -> OwnRows:
+def identical_rows(queries: Contents, database: Contents) -> IdenticalRows:
     """For each of the `queries`, the rows of files in the `database` with the same content."""
     rows = defaultdict(list)
     for row, file in enumerate(database.files):

@@ -24,7 +24,7 @@ from mfvpr.utils.errors import InputError
 from mfvpr.utils.files import IMAGE_SUFFIXES
 from mfvpr.utils.fingerprints import fingerprint, recipe_of
 
-OwnRows = tuple[tuple[int, ...], ...]  # database rows of files with the content of each query
+IdenticalRows = tuple[tuple[int, ...], ...]  # database rows of files with the content of each query
 MEANS = ("mean", "pooled")  # names in results of the means over sequences, and over all of their queries
 
 
@@ -104,17 +104,15 @@ class QuerySequence:
         truth = type(self.truth).__name__ if self.truth else "no ground truth"
         return f"QuerySequence({self.name}: {len(self.images)} queries, {truth})"
 
-    def without_neighbors(self, num_database: int, query_rows: OwnRows, neighbors: int) -> "QuerySequence":
+    def without_neighbors(self, num_database: int, query_rows: IdenticalRows, neighbors: int) -> "QuerySequence":
         """Exclude each query and its neighbors within `neighbors` frames from its candidates; 0 = the query alone.
 
         Excluded images are not correct either. `query_rows` are the rows of each query in the database, a sequence of
         `num_database` images; an `InputError` if no query is among them.
         """
         if not any(query_rows):
-            raise InputError(
-                f"exclude_neighbors={neighbors}: expected queries that are among the database images, got none in "
-                f"{self.images.root}; leave it out for two different sequences"
-            )
+            got = f"none in {self.images.root}; leave it out for two different sequences"
+            raise InputError(f"exclude_neighbors={neighbors}: expected queries among the database images, got {got}")
         excluded = FrameTruth(query_rows, num_database).positives(neighbors)
         truth = None if self.truth is None else AllowedTruth(self.truth, excluded)
         return replace(self, truth=truth, excluded=excluded)
@@ -141,9 +139,7 @@ class Dataset:
         """The only sequence; InputError if there are several."""
         if len(self.sequences) != 1:
             names = ", ".join(sequence.name for sequence in self.sequences)
-            raise InputError(
-                f"{self.name}: expected one query sequence, got {len(self.sequences)}; choose one of {names}"
-            )
+            raise InputError(f"{self.name}: expected one sequence, got {len(self.sequences)}; choose one of {names}")
         return self.sequences[0]
 
     @property
@@ -187,14 +183,14 @@ def image_folder(root: Path | str, *, orient: bool = True, bits: int | None = 16
         folders[:] = [name for name in folders if not name.startswith(".")]
         for path in (Path(folder, name) for name in folders):
             if path.is_symlink() and path.parent.resolve().is_relative_to(path.resolve()):
-                raise InputError(f"{path}: a link back to {path.resolve()}, which it is in; remove it")
+                raise InputError(f"{path}: expected files and folders, got a link back to {path.resolve()}; remove it")
         for path in (Path(folder, name) for name in files if not name.startswith(".")):
             if path.suffix.lower() in IMAGE_SUFFIXES:
                 names.append(path.relative_to(root).as_posix())
             elif path.is_symlink() and not path.exists():
-                raise InputError(f"{path}: a link to nothing, which may have been a folder; mend or remove it")
+                raise InputError(f"{path}: expected an image or a folder, got a link to nothing; mend or remove it")
     if not names:
-        raise InputError(f"{root}: expected images ({', '.join(sorted(IMAGE_SUFFIXES))}), found none; check the path")
+        raise InputError(f"{root}: expected images ({', '.join(sorted(IMAGE_SUFFIXES))}), got none; check the path")
 
     def natural(name: str) -> tuple[list[tuple[int, str]], str]:  # runs of digits compare as numbers of any length
         parts = [part.lstrip("0") if part.isdecimal() else part for part in re.split(r"(\d+)", name)]

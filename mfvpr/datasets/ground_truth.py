@@ -13,12 +13,12 @@ from dataclasses import dataclass
 from functools import partial
 from itertools import chain
 from pathlib import Path, PurePosixPath
-from typing import Any, ClassVar, Literal
+from typing import ClassVar, Literal
 
 import numpy as np
-from jaxtyping import Float, Float64, Int, Num
+from jaxtyping import Float, Int, Num
 
-from mfvpr.datasets.positives import Positives, positives_within
+from mfvpr.datasets.positives import Positives, positives_within, require_positions
 from mfvpr.io.containers import parse_number, read_npz, reading, require_all, shorten
 from mfvpr.utils.errors import InputError
 
@@ -30,7 +30,6 @@ CHOICES = (
     "@easting@northing@...); label (two csv files of name,label: images with the same label (floor, room) are "
     "correct); none (rankings only)"
 )
-FARTHEST = 1e9  # meters; beyond, distances are not exact to a centimeter
 _LINES = "lines (with an empty cell if it has no place or label)"
 _reading = partial(reading, kind="a ground truth file", mend="see mfvpr/datasets/README.md")
 
@@ -98,6 +97,11 @@ class FrameTruth(Truth):
     widened: bool = True
     starts: tuple[int, ...] = ()
 
+    def __post_init__(self) -> None:
+        if (rows := {*chain(*self.rows)}) and not 0 <= min(rows) <= max(rows) < self.num_database:
+            expected, got = f"rows of a database of {self.num_database} images", f"{min(rows)} to {max(rows)}"
+            raise InputError(f"rows: expected {expected}, got {got}; an unknown place has no rows")
+
     @property
     def unit(self) -> Unit:
         return "frames" if self.widened else "exact"
@@ -126,7 +130,7 @@ class FrameTruth(Truth):
 
 @dataclass(frozen=True)
 class RadiusTruth(Truth):
-    """Positions in meters; database images within a radius of the query are correct.
+    """Positions in meters, finite, up to 1e9; database images within a radius of the query are correct.
 
     Example:
         xy = np.stack([2.0 * np.arange(10), np.zeros(10)], axis=1)  # a position every 2 m
@@ -136,6 +140,10 @@ class RadiusTruth(Truth):
     unit: ClassVar[Unit] = "m"
     query_xy: Num[np.ndarray, "queries 2"]
     database_xy: Num[np.ndarray, "database 2"]
+
+    def __post_init__(self) -> None:
+        for side in ("query_xy", "database_xy"):
+            object.__setattr__(self, side, require_positions(side, getattr(self, side)))
 
     def positives(self, threshold: float) -> Positives:
         return positives_within(self.query_xy, self.database_xy, threshold)
@@ -191,15 +199,6 @@ class AllowedTruth(Truth):
         distance = np.array(self.truth.distance(query), np.float64)
         distance[self.excluded.of(query)] = np.inf
         return distance
-
-
-def require_positions(where: str, xy: Any, count: int) -> Float64[np.ndarray, "images 2"]:
-    """Positions in meters as float64; an InputError unless there is one for each of `count` images."""
-    xy = np.asarray(xy, np.float64)
-    if xy.shape != (count, 2) or not (np.abs(xy) <= FARTHEST).all():  # NaN neither
-        got = f"{[*xy.shape]} up to {np.abs(xy).max(initial=0):g} m"
-        raise InputError(f"{where}: expected positions [{count}, 2] of all images, at most {FARTHEST:g} m, got {got}")
-    return xy
 
 
 def truth_from_names(query_names: Sequence[str], database_names: Sequence[str]) -> RadiusTruth:
@@ -260,7 +259,7 @@ def truth_from_file(
         elif path.suffix.lower() == ".json":
             content = json.loads(path.read_text(encoding="utf-8"))
             if not all(isinstance(entry, list) and len(entry) == 2 and isinstance(entry[1], list) for entry in content):
-                raise InputError("expected [[query, [database, ...]], ...] as in VPR-Bench")
+                raise InputError("expected [[query, [database, ...]], ...] as in VPR-Bench, got others; convert it")
             content = [(query, place) for query, places in content for place in (places or [""])]
         elif path.suffix.lower() == ".npz":
             arrays = read_npz(path, ("utmQ", "utmDb", "query", "database"))
@@ -268,10 +267,10 @@ def truth_from_file(
                 sides = ("utmQ", query_names), ("utmDb", database_names)
                 return RadiusTruth(*(require_positions(name, arrays[name], len(names)) for name, names in sides))
             if not {"query", "database"} <= arrays.keys():
-                raise InputError("expected arrays query and database, or utmQ and utmDb, got neither")
+                raise InputError("expected arrays query and database, or utmQ and utmDb, got neither; rename them")
             content = list(zip(arrays["query"].tolist(), arrays["database"].tolist(), strict=True))
         else:
-            raise InputError(f"expected a file named .csv, .npz, .json, got {path.suffix or 'no suffix'}")
+            raise InputError(f"expected a file named .csv, .npz, .json, got {path.suffix or 'no suffix'}; convert it")
     sides = ("query", query_names, _row_table(query_names)), ("database", database_names, _row_table(database_names))
     rows: dict[int, list[int]] = {}
     for line, pair in enumerate(content, start=1):

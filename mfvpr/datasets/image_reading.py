@@ -103,8 +103,8 @@ def shape_size(shape: tuple[int, int], pixels: float, multiple: int = 1) -> tupl
     """
     short, long = sorted(shape)
     rounded = multiple * max(1, round(math.sqrt(pixels * short / long) / multiple))
-    other = multiple * round(rounded * long / short / multiple)
-    return (other, rounded) if shape[0] > shape[1] else (rounded, other)
+    longer = multiple * round(rounded * long / short / multiple)
+    return (longer, rounded) if shape[0] > shape[1] else (rounded, longer)
 
 
 def largest_16bit(content: bytes) -> int:

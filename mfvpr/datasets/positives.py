@@ -6,9 +6,12 @@ from typing import Any
 
 import numpy as np
 import scipy  # its subpackages take 0.2 s, and are imported at their first use
-from jaxtyping import Bool, Int, Integer, Num
+from jaxtyping import Bool, Float64, Int, Integer, Num
 
 from mfvpr.utils.errors import InputError
+
+FARTHEST = 1e9  # meters; beyond, distances are not exact to a centimeter
+_BLOCK = 1024  # queries whose pairs are searched together: a pair takes five times as much memory as its result
 
 
 @dataclass(frozen=True, eq=False)
@@ -28,7 +31,7 @@ class Positives:
 
     def __post_init__(self) -> None:
         if np.ndim(self.matrix) != 2:
-            raise InputError(f"positives: expected a matrix [queries, database], got shape {np.shape(self.matrix)}")
+            raise InputError(f"positives: expected a matrix [Q, N], got shape {np.shape(self.matrix)}; see from_rows")
         matrix = scipy.sparse.csr_array(self.matrix, dtype=bool)
         if not matrix.has_canonical_format or not matrix.data.all():
             matrix = matrix.copy()  # of the caller, perhaps
@@ -125,15 +128,28 @@ def stack_positives(parts: Sequence[Positives]) -> Positives:
     return Positives(scipy.sparse.vstack([part.matrix for part in parts], format="csr"))
 
 
+def require_positions(where: str, xy: Any, count: int | None = None) -> Float64[np.ndarray, "images 2"]:
+    """Positions in meters as float64, which has no overflow; an InputError unless all of `count` images have one."""
+    xy = np.asarray(xy)
+    is_number, count = xy.dtype.kind in "iuf", len(xy) if count is None else count
+    positions = xy.astype(np.float64) if is_number else np.full(xy.shape, np.nan)
+    if xy.shape != (count, 2) or not (np.abs(positions) <= FARTHEST).all():  # NaN neither
+        expected = f"positions [{count}, 2] of all images, at most {FARTHEST:g} m"
+        got = f"{xy.dtype}{[*xy.shape]} up to {np.abs(positions).max(initial=0):g} m; remove images without a position"
+        raise InputError(f"{where}: expected {expected}, got {got}")
+    return positions
+
+
 def positives_within(query_xy: np.ndarray, database_xy: np.ndarray, radius: float) -> Positives:
     """Database images at most `radius` meters away from each query; coordinates as in `radius_positives`."""
-    for xy in (query_xy, database_xy):
-        if np.size(xy) and np.shape(xy)[1:] != (2,):
-            raise InputError(f"positions: expected (x, y) [images, 2] in meters, got shape {np.shape(xy)}")
-    queries, database = (scipy.spatial.KDTree(np.reshape(xy, (-1, 2))) for xy in (query_xy, database_xy))
-    pairs = queries.sparse_distance_matrix(database, radius, output_type="ndarray")
-    content = np.ones(len(pairs), bool), (pairs["i"], pairs["j"])
-    return Positives(scipy.sparse.csr_array(content, shape=(queries.n, database.n)))
+    queries, parts = require_positions("query_xy", query_xy), []
+    database = scipy.spatial.KDTree(require_positions("database_xy", database_xy))
+    for start in range(0, max(1, len(queries)), _BLOCK):
+        block = scipy.spatial.KDTree(queries[start : start + _BLOCK])
+        pairs = block.sparse_distance_matrix(database, radius, output_type="ndarray")
+        content = np.ones(len(pairs), bool), (pairs["i"], pairs["j"])
+        parts.append(Positives(scipy.sparse.csr_array(content, shape=(block.n, database.n))))
+    return stack_positives(parts)
 
 
 def frame_positives(
@@ -158,7 +174,7 @@ def frame_positives(
 def radius_positives(
     query_xy: Num[np.ndarray, "queries 2"], database_xy: Num[np.ndarray, "database 2"], *, radius: float = 25.0
 ) -> Bool[np.ndarray, "queries database"]:
-    """Positives by position: at most `radius` meters apart. Coordinates are UTM, float64.
+    """Positives by position: at most `radius` meters apart. Coordinates are UTM, finite, of any type of numbers.
 
     Example:
         query_xy, database_xy = np.array([[0.0, 1.0]]), np.array([[0.0, 0.0], [0.0, 40.0]])

@@ -12,8 +12,8 @@ import numpy as np
 import scipy  # its subpackages are imported at their first use
 
 from mfvpr.datasets.datasets import Dataset, ImageFolder, QuerySequence, image_folder
-from mfvpr.datasets.ground_truth import FARTHEST, FrameTruth, RadiusTruth, Truth, require_positions, truth_from_file
-from mfvpr.datasets.positives import positives_within
+from mfvpr.datasets.ground_truth import FrameTruth, RadiusTruth, Truth, truth_from_file
+from mfvpr.datasets.positives import FARTHEST, positives_within, require_positions
 from mfvpr.io.containers import parse_number, reading
 from mfvpr.utils.errors import InputError
 
@@ -104,7 +104,7 @@ def ssm_vpr(root: Path) -> Content:
     for images in (database, queries):
         for row, image in enumerate(images.names):  # the table has the numbers at the ends of the names
             if not re.search(rf"(^|\D)0*{row}$", PurePosixPath(image).stem):
-                raise InputError(f"{images.root}: expected images numbered from 0 without gaps, got {image}")
+                raise InputError(f"{images.root}: expected images numbered from 0 without gaps, got {image}; get all")
     return database, queries, truth_from_file(root / "GroundTruth.csv", queries.names, database.names, widened=True)
 
 
@@ -145,7 +145,7 @@ def nordland_vprbench(root: Path) -> Content:
     """VPR-Bench's variant (Zaffar et al., IJCV 2021): every tenth frame is a query; correct within 1 frame."""
     database, queries = image_folder(root / "ref"), image_folder(root / "query")
     if 10 * (len(queries) - 1) >= len(database):
-        raise InputError(f"{root}: expected 10 database images per query, got {len(database)} for {len(queries)}")
+        raise InputError(f"{root}: expected 10 images per query, got {len(database)} for {len(queries)}; get them all")
     return database, queries, FrameTruth(tuple((10 * row,) for row in range(len(queries))), len(database))
 
 
@@ -222,10 +222,7 @@ def msls_val(root: Path) -> Content:
                 if flags[tasks[key]["all"]] and not flags[raw[key]["pano"]]:
                     names[side].append(f"train_val/{city}/{side}/images/{key}.jpg")
                     positions[side].append([parse_number(line["easting"]), parse_number(line["northing"])])
-    places = {
-        side: require_positions(f"{root}: {side}", np.reshape(xy, (-1, 2)), len(names[side]))
-        for side, xy in positions.items()
-    }
+    places = {side: require_positions(f"{root}: {side}", np.reshape(xy, (-1, 2))) for side, xy in positions.items()}
     rows = np.flatnonzero(positives_within(places["query"], places["database"], 25.0).counts)
     database = listed_images(root, names["database"], root / "train_val")
     queries = listed_images(root, [names["query"][row] for row in rows], root / "train_val")
@@ -235,11 +232,12 @@ def msls_val(root: Path) -> Content:
 def listed_images(root: Path, names: Sequence[str], origin: Path) -> ImageFolder:
     """The images below `root` with the names of a list; `origin` is the list, for messages."""
     if not names or len({*names}) < len(names):
-        raise InputError(f"{origin}: expected every image once, got {len(names) - len({*names})} twice of {len(names)}")
+        got = f"{len(names) - len({*names})} twice of {len(names)}"
+        raise InputError(f"{origin}: expected every image once, got {got}; get the data set again")
     missing = [name for name in names if not (root / name).is_file()]
     if missing:
-        got = f"{len(missing):,} of the {len(names):,} images of {origin.name} are missing, the first is {missing[0]}"
-        raise InputError(f"{root}: {got}; get the whole data set")
+        got = f"all but {len(missing):,}, the first of which is {missing[0]}"
+        raise InputError(f"{root}: expected {len(names):,} images of {origin.name}, got {got}; get the whole data set")
     return ImageFolder(root, tuple(names))
 
 

@@ -153,6 +153,7 @@ def load_exported(folder: Path | str) -> ExportedProgram:
     An `InputError` if a file is missing, or if this version of JAX cannot read the program.
     """
     folder = Path(folder)
+    _require("flatbuffers", "load_exported")
     with reading(folder / DESCRIPTION, "a folder of mfvpr.export with this file", "export it again"):
         description = json.loads((folder / DESCRIPTION).read_text(encoding="utf-8"))
         if description["format"] != FORMAT:
@@ -285,9 +286,9 @@ def largest_difference(arrays: dict[str, np.ndarray], expected: dict[str, np.nda
     return max(differences)
 
 
-def _require(package: str, what: str) -> None:
+def _require(package: str, option: str) -> None:
     if find_spec(package) is None:
-        raise InputError(f"{what}: expected the package {package}, got none; pip install 'mfvpr[export]'")
+        raise InputError(f"{option}: expected the package {package}, got none; pip install 'mfvpr[export]'")
 
 
 def _one_line(error: Exception) -> str:

@@ -137,7 +137,7 @@ def confidence_from_json(values: Mapping[str, Any]) -> Confidence:
     _, scale, weights, shares = numbers
     is_known = values.get("apart", APART) == APART and np.isfinite([*numbers.flat, values["bias"]]).all()
     if not (is_known and min(*scale, *shares) > 0 and min(weights) >= 0 and max(shares) <= 1):
-        raise ValueError("values that make no model")
+        raise InputError("confidence: expected a model of this version, got other values; calibrate again")
     return Confidence(bias=values["bias"], **vectors, standardize=values.get("standardize"))
 
 

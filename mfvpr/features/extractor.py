@@ -175,7 +175,8 @@ def describe_images(images: Num[np.ndarray, "images height width 3"], extractor:
         if (got := [features.descriptors.shape[-1] for features in local]) != dimensions:
             raise InputError(f"{name}: expected local features of {dimensions} dimensions, as in `scales`, got {got}")
         if (size := 0 if vector is None else np.size(vector)) != extractor.vector_size:
-            raise InputError(f"{name}: vector_size={extractor.vector_size}, but a description with {size} numbers")
+            expected = f"a global descriptor of vector_size={extractor.vector_size} numbers"
+            raise InputError(f"{name}: expected {expected}, got {size}; change either")
         unpadded = Description(vector, tuple(map(without_padding, local)))
         is_finite = all(np.isfinite(array).all() for array in jax.tree.leaves(unpadded))
         descriptions.append(unpadded if is_finite else None)

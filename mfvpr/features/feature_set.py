@@ -23,7 +23,7 @@ from mfvpr.utils.numerics import Device, compiled, free_bytes, repeat_last, roun
 SHARE = 1 / 3  # of the free memory, by default
 STEP = 32  # capacities are multiples of it
 WRITTEN = 16  # rows that go to the device at a time: one program
-KEPT, STAGED = 3 / 5, 1 / 24  # of the budget: for rows that stay, and for each of up to six parts on their way
+RESIDENT, STAGED = 3 / 5, 1 / 24  # of the budget: for rows that stay, and for each of up to six parts on their way
 
 
 class FeatureSource(Protocol):
@@ -120,22 +120,22 @@ class Staged(NamedTuple):
 class Slots:
     """Rows of a feature set on one device, padded, in slots of a few capacities; the least recently used makes room.
 
-    An image's capacity depends on its count and those of all `wanted` images, never on the images that it is matched
+    An image's capacity depends on its count and those of all planned images, never on the images that it is matched
     with. `stage` reads rows, and may run ahead on another thread by two calls; `put` writes them to the device.
     """
 
-    def __init__(self, features: FeatureSet, wanted: Int[np.ndarray, " rows"], budget: int, device: Device) -> None:
-        """Plan empty slots for the distinct rows `wanted`, with `budget` bytes for them and for rows on their way."""
+    def __init__(self, features: FeatureSet, planned: Int[np.ndarray, " rows"], budget: int, device: Device) -> None:
+        """Plan empty slots for the distinct `planned` rows, with `budget` bytes for them and for rows on their way."""
         self._features, self._device = features, device
         counts = features.counts
         # The capacity that fits all counts, and a smaller one for half of the images if it saves a quarter.
-        half, most = few_capacities(counts[wanted], (0.5, 1.0), STEP)[[0, -1]].tolist()
+        half, most = few_capacities(counts[planned], (0.5, 1.0), STEP)[[0, -1]].tolist()
         capacities = [half, most] if half <= 0.75 * most else [most]
         self._capacity = np.array(capacities)[np.searchsorted(capacities, np.minimum(counts, most))]
-        wanted = wanted[counts[wanted] > 0]
-        rows = {capacity: int(np.sum(self._capacity[wanted] == capacity)) for capacity in capacities}
-        size = features.keypoint_bytes if len(wanted) else 1
-        share = KEPT * budget / max(1, sum(capacity * size * number for capacity, number in rows.items()))
+        planned = planned[counts[planned] > 0]
+        rows = {capacity: int(np.sum(self._capacity[planned] == capacity)) for capacity in capacities}
+        size = features.keypoint_bytes if len(planned) else 1
+        share = RESIDENT * budget / max(1, sum(capacity * size * number for capacity, number in rows.items()))
         self._part_size = max(WRITTEN, int(STAGED * budget / (most * size)))
         self._numbers: dict[int, int] = {}  # of slots, by capacity
         for capacity, number in rows.items():
@@ -155,17 +155,17 @@ class Slots:
         capacity, slot = self._capacity[distinct], np.zeros(len(distinct), np.int32)
         missing: list[tuple[int, list[int]]] = []
         for size, slots in self._slots.items():
-            wanted = distinct[capacity == size].tolist()
-            if len(wanted) > self._numbers[size]:
-                raise ValueError(f"expected at most {self._numbers[size]} rows at the same time, got {len(wanted)}")
-            new = [row for row in wanted if row not in slots]
-            for row in wanted:  # before new rows come, so that none of these rows makes room for them
+            members = distinct[capacity == size].tolist()
+            if len(members) > self._numbers[size]:
+                raise ValueError(f"expected at most {self._numbers[size]} rows at the same time, got {len(members)}")
+            new = [row for row in members if row not in slots]
+            for row in members:  # before new rows come, so that none of these rows makes room for them
                 if row in slots:
                     slots.move_to_end(row)
             for row in new:
                 is_full = len(slots) == self._numbers[size]
                 slots[row] = slots.popitem(last=False)[1] if is_full else len(slots)
-            slot[capacity == size] = [slots[row] for row in wanted]
+            slot[capacity == size] = [slots[row] for row in members]
             missing += [(size, new[start : start + WRITTEN]) for start in range(0, len(new), WRITTEN)]
         features = self._features.read([row for _, new in missing for row in new])
         writes = []

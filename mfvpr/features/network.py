@@ -320,7 +320,7 @@ def in_batches(
     `InputError`.
     """
     if images.dtype.kind == "f" and images.size and 0 < (largest := images.max()) <= 1:
-        raise InputError(f"images: expected values from 0 to 255, the largest is {largest:.3g}; multiply by 255")
+        raise InputError(f"images: expected values from 0 to 255, got at most {largest:.3g}; multiply by 255")
     on_host = device_bytes(()) is None
     size = 1 if on_host else min(batch_size, TOGETHER)
 

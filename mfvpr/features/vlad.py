@@ -49,10 +49,9 @@ class VladFitting:
         """Learn the vocabulary from random images of the database, or from all if they have few descriptors."""
         counts = database.counts
         if counts.sum() < self.num_words:
-            raise InputError(
-                f"{counts.sum()} local features in {len(database)} database images: expected at least one for each of "
-                f"the {self.num_words} words; check the images and what finds their features, or lower num_words"
-            )
+            expected = f"at least one local feature for each of num_words={self.num_words} words"
+            got = f"{counts.sum()} in {len(database)} database images; check images and extractor, or lower num_words"
+            raise InputError(f"VLAD: expected {expected}, got {got}")
         rng = np.random.default_rng(self.seed)
         rows = rng.permutation(len(database))  # whole images: one more feature in an image leaves the others' as is
         num_images = 1 + np.searchsorted(np.cumsum(counts[rows]), self.max_samples)
@@ -80,7 +79,7 @@ class Vlad:
         descriptors = np.concatenate(per_image)
         if descriptors.shape[1] != self.centers.shape[1]:
             expected = f"{self.centers.shape[1]} dimensions, as those that it was fitted on"
-            raise InputError(f"VLAD: expected descriptors of {expected}, got {descriptors.shape[1]}")
+            raise InputError(f"VLAD: expected descriptors of {expected}, got {descriptors.shape[1]}; fit it again")
         # No matrix product: its threads stay awake for a while and take the cores from the matching that comes next.
         products = np.vecdot(descriptors[:, None], self.centers)
         word = np.argmin((self.centers**2).sum(1) - 2 * products, axis=1)  # the first on a tie

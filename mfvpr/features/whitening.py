@@ -177,7 +177,7 @@ def learned_whitening(extractor: Any) -> Whitening:
     """Learned whitening of an extractor; an `InputError` if it was not learned yet, or from something else."""
     name, whitening, expected = type(extractor).__name__, extractor.whitening, extractor.windows.dimension
     if not isinstance(whitening, Whitening):
-        raise InputError(f"{name}: has not seen the database; take mfvpr.retrieval.fit_to_database(...) of it")
+        raise InputError(f"{name}: expected a learned whitening, got settings; call mfvpr.retrieval.fit_to_database")
     if len(whitening.mean) != expected or whitening.origin not in ("", origin(extractor)):
         got = f"one of {len(whitening.mean)} that was learned with others; replace it by a WindowFitting"
         same = f"{expected} numbers that was learned with the same network, images and windows"

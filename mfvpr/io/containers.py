@@ -41,7 +41,7 @@ class H5File:
         images = (name.rpartition("/")[0] for name in names if name not in groups)
         self.entries = {image: FileEntry(path, image) for image in images if image}
         if not self.entries:
-            raise InputError(f"{path}: expected a group for every image, as hloc writes them, got no datasets")
+            raise InputError(f"{path}: expected a group for every image, as in hloc, got no datasets; extract again")
 
     def read(self, images: Iterable[str], parts: Sequence[str], *, shapes: bool = False) -> Iterator[dict[str, Any]]:
         """For each image, its arrays among `parts`; their shapes alone, without reading values, if `shapes`."""
@@ -60,7 +60,8 @@ class H5File:
             got = "none, a group or a link; copy linked data into the file, or extract this image again"
             raise InputError(f"{where}: expected data in this file, got {got}")
         if dataset.nbytes > max(MAX_INFLATED, stored):
-            raise InputError(f"{where}: expected at most 1 GiB in a compressed dataset; write it uncompressed")
+            got = f"{dataset.nbytes:,} bytes; write it uncompressed"
+            raise InputError(f"{where}: expected at most 1 GiB in a compressed dataset, got {got}")
         return dataset
 
     @contextmanager
@@ -86,16 +87,16 @@ class NpzFiles:
                 inside = file.relative_to(path)
                 if file.suffix not in SUFFIXES or any(part.startswith(".") for part in inside.parts):
                     continue
-                other = self.entries.setdefault(inside.as_posix().removesuffix(file.suffix), FileEntry(file, "")).file
-                if other != file:
-                    raise InputError(f"{file}: {other.name} beside it is of the same image; remove either")
+                first = self.entries.setdefault(inside.as_posix().removesuffix(file.suffix), FileEntry(file, "")).file
+                if first != file:
+                    raise InputError(f"{file}: expected one file of an image, got {first.name} as well; remove either")
         else:
             with _open_npz(path) as archive:
                 images = (name.rpartition("/")[0] for name in archive.files)
                 self.entries = {image: FileEntry(path, image) for image in images if image}
         if not self.entries:
             expected = f"arrays named by images (a.jpg/keypoints), or a folder of files {' or '.join(SUFFIXES)}"
-            raise InputError(f"{path}: expected {expected}, got none")
+            raise InputError(f"{path}: expected {expected}, got none; check the path")
 
     def read(self, images: Iterable[str], parts: Sequence[str], *, shapes: bool = False) -> Iterator[dict[str, Any]]:
         """As `H5File.read`."""
@@ -188,7 +189,7 @@ def _open_npz(path: Path) -> Iterator[Any]:
     with reading(path), path.open("rb") as file:
         archive = np.load(file, allow_pickle=False)
         if not isinstance(archive, np.lib.npyio.NpzFile):
-            raise InputError("expected an archive of NumPy (.npz), got an array")
+            raise InputError("expected an archive of NumPy (.npz), got an array; save it with np.savez")
         with archive:
             yield archive
 
@@ -199,7 +200,8 @@ def _read(archive: Any, name: str, shape: bool = False) -> Any:
         with archive.zip.open(entry) as file:
             return read_npy_header(file)[0]
     if entry.file_size > max(MAX_INFLATED, entry.compress_size):
-        raise InputError(f"{shorten(name)}: expected at most 1 GiB in a compressed array; write it uncompressed")
+        got = f"{entry.file_size:,} bytes; write it uncompressed"
+        raise InputError(f"{shorten(name)}: expected at most 1 GiB in a compressed array, got {got}")
     return np.asarray(archive[name])
 
 
@@ -207,7 +209,7 @@ def _h5py(path: Path) -> Any:
     try:
         import h5py
     except ImportError:
-        raise InputError(f"{path}: HDF5 needs the package h5py; pip install 'mfvpr[hloc]'") from None
+        raise InputError(f"{path}: expected the package h5py for HDF5, got none; pip install 'mfvpr[hloc]'") from None
     return h5py
 
 
@@ -240,23 +242,23 @@ def match_names(path: Path, names: Sequence[str], foreign: Iterable[str]) -> lis
                 free[PurePosixPath(spelling).name].append((name, _parts(spelling)))
         pairs = dict[tuple[int, str], tuple]()  # row and name -> prefix
         for row in (row for row, match in enumerate(matched) if match is None):
-            ours = spellings(printable(names[row]))[0]
-            parts = _parts(ours)
-            for name, theirs in free[PurePosixPath(ours).name]:
-                shared = min(len(parts), len(theirs))
-                if parts[-shared:] == theirs[-shared:]:  # one path is the end of the other
-                    pairs[row, name] = theirs[:-shared], parts[:-shared]
+            spelling = spellings(printable(names[row]))[0]
+            parts = _parts(spelling)
+            for name, name_parts in free[PurePosixPath(spelling).name]:
+                shared = min(len(parts), len(name_parts))
+                if parts[-shared:] == name_parts[-shared:]:  # one path is the end of the other
+                    pairs[row, name] = name_parts[:-shared], parts[:-shared]
         is_known = prefix is not None
         prefix = prefix or next(iter(pairs.values()), None)
         chosen = [pair for pair in sorted(pairs) if pairs[pair] == prefix]
         rows, images = Counter(row for row, _ in chosen), Counter(name for _, name in chosen)
         for row, name in sorted(pairs):
-            has_other_prefix = pairs[row, name] != prefix and not is_exact and not (is_known and rows[row])
-            if has_other_prefix or rows[row] > 1 or images[name] > 1:
+            differs = pairs[row, name] != prefix and not is_exact and not (is_known and rows[row])
+            if differs or rows[row] > 1 or images[name] > 1:
                 expected = "one name for each image, and one prefix for all images of a folder"
-                others = [each for each in sorted(pairs) if each != (row, name) and (row in each or name in each)]
-                both = [*(others or chosen)[:1], (row, name)]
-                got = " and ".join(f"{shorten(theirs)} for {shorten(names[ours])}" for ours, theirs in both)
+                rivals = [pair for pair in sorted(pairs) if pair != (row, name) and (row in pair or name in pair)]
+                both = [*(rivals or chosen)[:1], (row, name)]
+                got = " and ".join(f"{shorten(name)} for {shorten(names[row])}" for row, name in both)
                 raise InputError(f"{path}: expected {expected}, got {got}; {_FULL_NAMES}")
         for row, name in chosen:
             matched[row] = name
@@ -281,10 +283,8 @@ def require_all(path: Path, names: Sequence[str], matched: Sequence[Entry | None
     """Return what a file has of each image, if that is not None; InputError if it lacks the `content` of an image."""
     missing = [name for name, match in zip(names, matched, strict=True) if match is None]
     if missing:
-        raise InputError(
-            f"{path}: expected {content} of all {len(names)} images, got {len(names) - len(missing)}; the first "
-            f"without is {shorten(missing[0])} (names are paths below the folder)"
-        )
+        got = f"{len(names) - len(missing)}; the first without is {shorten(missing[0])} (names are paths in the folder)"
+        raise InputError(f"{path}: expected {content} of all {len(names)} images, got {got}")
     return [match for match in matched if match is not None]
 
 
@@ -299,13 +299,12 @@ def require_one_image(
     for image, entry in zip(images, entries, strict=True):
         if entry is None:
             continue
-        other = known.setdefault((resolved[entry.file], entry.name), image)
-        if other != image and other.resolve() != image.resolve():
+        first = known.setdefault((resolved[entry.file], entry.name), image)
+        if first != image and first.resolve() != image.resolve():
             name = shorten(entry.name or entry.file.name)
-            raise InputError(
-                f"{path}: expected one image for each entry, got {name} for {shorten(str(other), 300)} and for "
-                f"{shorten(str(image), 300)}; {_FULL_NAMES}, or a file for each folder"
-            )
+            got = f"{name} for {shorten(str(first), 300)} and for {shorten(str(image), 300)}"
+            mend = f"{_FULL_NAMES}, or a file for each folder"
+            raise InputError(f"{path}: expected one image for each entry, got {got}; {mend}")
 
 
 def adds_folders(name: str, match: str) -> bool:

@@ -161,7 +161,7 @@ def open_features(
         got = f"lengths {sorted(dimensions)}"
         raise InputError(f"{path}: expected descriptors of one layout, [D, N] or [N, D], and of one length, got {got}")
     if len(has_scores) > 1:  # a missing score would become 1
-        raise InputError(f"{path}: expected scores of all images or of none, got some without")
+        raise InputError(f"{path}: expected scores of all images or of none, got some without; extract them again")
     layout, dimension = next(iter(layouts), container.transposed), next(iter(dimensions), 0)
     return ImportedFeatures(path, counts, dimension, container, images, layout, sizes, lengths)
 
@@ -209,10 +209,8 @@ def require_inside(where: str, keypoints: np.ndarray, size: np.ndarray) -> None:
     outside = ((keypoints < -margin) | (keypoints > size - 1 + margin)).any(axis=1)
     if outside.any():
         x, y = keypoints[int(outside.argmax())].tolist()
-        raise InputError(
-            f"{where}: expected keypoints (x, y) in an image of {size[0]:g} x {size[1]:g} pixels, got ({x:g}, {y:g}); "
-            "check image_size (width, height)"
-        )
+        expected, mend = f"an image of {size[0]:g} x {size[1]:g} pixels", "check image_size (width, height)"
+        raise InputError(f"{where}: expected keypoints (x, y) in {expected}, got ({x:g}, {y:g}); {mend}")
 
 
 def read_global_descriptors(
@@ -265,7 +263,7 @@ def read_global_descriptors(
         entries = require_all(path, names, match_names(path, names, file.entries), "descriptors")
         vectors = [parts.get(GLOBAL, np.zeros((0, 0))) for parts in file.read(entries, (GLOBAL,))]
         if len(shapes := {vector.shape for vector in vectors}) > 1:
-            raise InputError(f"{path}: expected {GLOBAL} [D] of all images, with one D, got {sorted(shapes)}")
+            raise InputError(f"{path}: expected {GLOBAL} [D] of all images, one D, got {sorted(shapes)}; extract again")
         values = np.stack(vectors) if vectors else np.zeros((0, 0), np.float32)
     _require_rows(path, values, names)
     if check_entries is not None:
@@ -294,7 +292,8 @@ def write_global_descriptors(
     elif suffix in (".h5", ".hdf5"):
         write_h5(path, ((name, {GLOBAL: value}) for name, value in zip(names, values, strict=True)))
     else:
-        raise InputError(f"{path}: expected a name that ends with .npy, .npz, .h5 or .hdf5")
+        got = path.suffix or "no suffix"
+        raise InputError(f"{path}: expected a name that ends with .npy, .npz, .h5 or .hdf5, got {got}; rename it")
 
 
 def _require_rows(path: Path, descriptors: np.ndarray, names: Sequence[str]) -> None:
@@ -315,7 +314,7 @@ def _scaled(
             got = f"length {norms[worst]:.4g} at {worst}; set lengths='normalize' to scale descriptors, or 'keep'"
             raise InputError(f"{where}: expected unit length, got {got}")
     elif not norms.all():
-        raise InputError(f"{where}: expected descriptors with a direction, got zeros at {int(norms.argmin())}")
+        raise InputError(f"{where}: expected lengths above 0, got zeros at {int(norms.argmin())}; extract again")
     scale = np.where(np.abs(norms - 1) > EXACT, norms, 1.0)  # unit length in float32: no bit changes
     return (descriptors / scale[:, None]).astype(np.float32)
 

@@ -81,7 +81,7 @@ class ImportedMatches:
             if not self._use_confidences or not first.size:
                 confidence = None
             elif self._has_confidences not in (None, confidence is not None):
-                raise InputError(f"{where}: expected confidences of all pairs or of none; set confidences=False")
+                raise InputError(f"{where}: expected confidences of all pairs or of none, got some; see confidences=")
             else:
                 self._has_confidences = confidence is not None
             if self.numbered:
@@ -114,8 +114,8 @@ class ImportedMatches:
 
     def _features(self, side: int, rows: list[int]) -> dict[tuple[int, int], Features]:
         """Features of images of a side, by side and row."""
-        if (given := self._sides[side].features) is not None:
-            return {(side, row): features for row, features in given.read(rows)}
+        if (imported := self._sides[side].features) is not None:
+            return {(side, row): features for row, features in imported.read(rows)}
         features, files = {}, self._files
         for row in rows:
             name = str(self.names[side][row])
@@ -130,7 +130,7 @@ class ImportedMatches:
         """Size of the image that points are in; an InputError if nobody knows it."""
         if stored is not None and self._image_size is not None and tuple(stored) != tuple(self._image_size):
             expected = f"the argument image_size={list(self._image_size)}"
-            raise InputError(f"{self.path}: expected {expected}, got {list(stored)}")
+            raise InputError(f"{self.path}: expected {expected}, got {list(stored)}; leave it out")
         size_of = self._sides[side].size if self._files.in_image_files else None
         size = stored or self._image_size or (size_of and size_of(row))
         if size is None or not all(isinstance(length, int | float) and 0 < length < np.inf for length in size):

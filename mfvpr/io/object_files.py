@@ -78,12 +78,12 @@ def open_torch_archive(file: BinaryIO) -> Iterator[tuple[zipfile.ZipFile, str, B
     """
     with zipfile.ZipFile(file) as archive:
         if any(entry.compress_type != zipfile.ZIP_STORED for entry in archive.infolist()):
-            raise InputError("expected uncompressed entries of the zip file; use the official file")
+            raise InputError("expected uncompressed entries of the zip, got compressed ones; use the official file")
         if broken := archive.testzip():
-            raise InputError(f"the file is damaged, by the checksum of {shorten(broken)}; get it again")
+            raise InputError(f"expected a whole file, got another checksum of {shorten(broken)}; get it again")
         pickles = [name for name in archive.namelist() if name.split("/")[1:] == ["data.pkl"]]
         if len(pickles) != 1:
-            raise InputError("expected a file of torch.save, got another zip file")
+            raise InputError("expected a file of torch.save, got another zip file; save it again")
         yield archive, pickles[0].removesuffix("data.pkl"), io.BytesIO(archive.read(pickles[0]))
 
 

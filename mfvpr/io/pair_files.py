@@ -67,7 +67,8 @@ def open_pairs(path: Path, names: tuple[Sequence[str], Sequence[str]], verified:
     if kind is open_colmap:
         return open_colmap(path, verified)
     if verified:
-        raise InputError(f"{path}: expected COLMAP's .db, or results of vismatch or To-Match, with verified=True")
+        expected = "COLMAP's .db, or results of vismatch or To-Match, with verified=True"
+        raise InputError(f"{path}: expected {expected}, got another format; set verified=False")
     return kind(path)
 
 
@@ -97,7 +98,7 @@ def open_hloc(path: Path) -> PairFiles:
         for group, arrays in zip(places, file.read(places, parts), strict=True):
             where, score = f"{path}: {shorten(group)}", arrays.get(parts[-1])
             if not {*parts[:-1]} <= arrays.keys():
-                raise InputError(f"{where}: expected {' and '.join(parts[:-1])}, got {', '.join(arrays) or 'none'}")
+                raise InputError(f"{where}: expected {' and '.join(parts[:-1])}, got {[*arrays]}; match again")
             if not by_number:
                 yield FileMatches(arrays["keypoints0"], arrays["keypoints1"], score)
                 continue
@@ -105,15 +106,17 @@ def open_hloc(path: Path) -> PairFiles:
             is_number = partners.ndim == 1 and partners.dtype.kind in "iu" and not (partners < -1).any()
             if not is_number or (score is not None and score.shape != partners.shape):
                 mend = "hloc writes int16, so match at most 32768 keypoints"
-                raise InputError(f"{where}: expected integers matches0 [N] from -1, and as many scores; {mend}")
+                got = f"{partners.dtype}{[*partners.shape]}; {mend}"
+                raise InputError(f"{where}: expected integers matches0 [N] from -1, and as many scores, got {got}")
             first = np.flatnonzero(partners >= 0)
             yield FileMatches(first, partners[first], None if score is None else score[first])
 
-    places = {
-        (spelling(first), spelling(second)): f"{first}/{second}" for first, second in (g.split("/") for g in groups)
-    }
+    places: dict[Pair, str] = {}
+    for group in groups:
+        first, second = map(spelling, group.split("/"))
+        places[first, second] = group
     if len(places) < len(groups):
-        raise InputError(f"{path}: expected different names of images, got two that differ by - and / alone")
+        raise InputError(f"{path}: expected different names, got two that differ by - and / alone; rename an image")
     return PairFiles(path, places, read, by_number, spelling=spelling)
 
 
@@ -141,7 +144,7 @@ def open_colmap(path: Path, verified: bool = False) -> PairFiles:
         with _open_database(path) as database:
             rows, columns, content = database.execute(query, (number,)).fetchone() or (0, 2, b"")
             if rows and columns < 2:
-                raise InputError(f"expected 2 or more columns in {table}, got {columns}")
+                raise InputError(f"expected 2 or more columns in {table}, got {columns}; match again")
             return np.frombuffer(content, dtype).reshape(rows, columns) if rows else np.zeros((0, 2), dtype)
 
     def read(places: Sequence[int]) -> Iterator[FileMatches]:
@@ -293,7 +296,8 @@ def read_predictions(path: Path) -> tuple[str, list[str]]:
             parts[heading].append(printable(line))
     if parts[""] or len(parts[QUERY]) != 1 or not parts[PREDICTIONS]:
         expected = f"one path below {QUERY!r}, and one or more below {PREDICTIONS!r}"
-        raise InputError(f"{path}: expected {expected}, as VPR-methods-evaluation writes them")
+        got = f"{len(parts[QUERY])} and {len(parts[PREDICTIONS])}; write them as VPR-methods-evaluation"
+        raise InputError(f"{path}: expected {expected}, got {got}")
     return parts[QUERY][0], parts[PREDICTIONS]
 
 
@@ -301,7 +305,8 @@ def read_num_inliers(path: Path, most: int) -> list[float]:
     """Numbers of inliers of a query with its predictions, in their order; an InputError for more than `most`."""
     counts: list[Any] = [result.get("num_inliers") for result in _read_results(path, most)]
     if not counts or not all(type(count) is int and 0 <= count < 2**31 for count in counts):
-        raise InputError(f"{path}: expected num_inliers of each prediction, a whole number from 0")
+        got = f"{shorten(str(counts))}; match again"
+        raise InputError(f"{path}: expected num_inliers of each prediction, a whole number from 0, got {got}")
     return list(map(float, counts))
 
 
@@ -320,7 +325,7 @@ def _read_torch(path: Path, kind: type = dict) -> Any:
         with open_torch_archive(file) as (_, _, content):
             result = ArrayUnpickler(content).load()
         if not isinstance(result, kind):
-            raise InputError(f"expected a {kind.__name__} of results, got {type(result).__name__}")
+            raise InputError(f"expected a {kind.__name__} of results, got {type(result).__name__}; match again")
         return result
 
 
@@ -340,13 +345,11 @@ def _matches_of(file: Path, result: Mapping[str, Any], verified: bool) -> FileMa
         real = numbers >= 0
         shapes = {points0.shape[:1], numbers.shape, (numbers if confidence is None else confidence).shape}
         if len(shapes) > 1 or numbers.dtype.kind not in "iu" or (numbers[~real] != -1).any():
-            raise InputError(
-                f"{file}: expected matches [N] of keypoints0 [N, 2], a row of keypoints1 or -1, got others"
-            )
+            expected = "matches [N] of keypoints0 [N, 2], a row of keypoints1 or -1"
+            raise InputError(f"{file}: expected {expected}, got {numbers.dtype}{[*numbers.shape]}; match again")
         if real.any() and numbers.max() >= len(points1):
-            raise InputError(f"{file}: expected matches below the {len(points1)} keypoints1, got {numbers.max()}")
-        return FileMatches(
-            points0[real], points1[numbers[real]], None if confidence is None else confidence[real], sizes
-        )
+            raise InputError(f"{file}: expected matches below {len(points1)}, got {numbers.max()}; match again")
+        confidence = None if confidence is None else confidence[real]
+        return FileMatches(points0[real], points1[numbers[real]], confidence, sizes)
     expected = " and ".join(_INLIERS[:2]) if verified else "points0 and points1, or matched_kpts0 and matched_kpts1"
     raise InputError(f"{file}: expected {expected}, got {shorten(', '.join(sorted(parts))) or 'none'}")

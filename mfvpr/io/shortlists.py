@@ -73,9 +73,9 @@ def read_shortlist(
     for query, row, score in pairs:
         candidates[query].setdefault(row, score)  # of several scores, the first counts
     if not any(candidates):
-        raise InputError(f"{path}: expected candidates of {len(query_names)} queries, got none at all")
+        raise InputError(f"{path}: expected candidates of {len(query_names)} queries, got none at all; check the names")
     if len(has_score := {score is not None for rows in candidates for score in rows.values()}) == 2:
-        raise InputError(f"{path}: expected scores of all pairs or of none, got some without")
+        raise InputError(f"{path}: expected scores of all pairs or of none, got some without; write all scores")
     depth = num_candidates or max(map(len, candidates))
     indices = np.full((len(candidates), depth), -1, np.int32)
     scores = np.zeros((len(candidates), depth), np.float32)
@@ -113,9 +113,9 @@ def write_shortlist(
     require_word("layout", layout, PairLayout)
     indices, scores, mask = (np.asarray(part) for part in (shortlist.indices, shortlist.scores, shortlist.mask))
     if len(indices) != len(query_names):
-        raise InputError(f"{path}: expected the names of {len(indices)} queries, got {len(query_names)}")
+        raise InputError(f"{path}: expected names of {len(indices)} queries, got {len(query_names)}; name all queries")
     if indices.max(initial=-1) >= len(database_names):
-        raise InputError(f"{path}: expected database rows below {len(database_names)}, got {indices.max()}")
+        raise InputError(f"{path}: expected database rows below {len(database_names)}, got {indices.max()}; name all")
     is_npz = path.suffix.lower() == ".npz"
     for query in range(len(indices)) if is_npz or layout == "kapture" else ():
         _descending(f"{path}: {shorten(query_names[query])}", scores[query][mask[query]])
@@ -183,15 +183,15 @@ def _read_predictions(folder: Path) -> list[ScoredPair]:
     pairs, files = [], dict[str, Path]()
     for path in sorted(folder.glob("*.txt")):
         query, predictions = read_predictions(path)
-        if (other := files.setdefault(query, path)) != path:
-            raise InputError(f"{path}: expected another query than in {other.name}; remove the files of older runs")
+        if (first := files.setdefault(query, path)) != path:
+            raise InputError(f"{path}: expected another query than in {first.name}; remove the files of older runs")
         counts: Any = [None] * len(predictions)
         if (results := path.with_suffix(".torch")).exists():
             counts = read_num_inliers(results, len(predictions))
         scored = zip(predictions, counts, strict=False)  # predictions that were not matched are no candidates
         pairs += [(query, *each) for each in sorted(scored, key=lambda pair: -(pair[1] or 0))]
     if not files:
-        raise InputError(f"{folder}: expected text files of predictions, one for each query, got none")
+        raise InputError(f"{folder}: expected text files of predictions, one for each query, got none; check the path")
     return pairs
 
 

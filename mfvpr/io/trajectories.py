@@ -120,7 +120,7 @@ def write_trajectory(path: Path | str, poses: Sequence[str | None], stamps: Sequ
         expected = f"a pose of {num_numbers} numbers in each line of the poses"
         raise InputError(f"{path}: expected {expected}, got {len(places[0].split())}; TUM's have a time, KITTI's none")
     if stamps is not None and len({*stamps}) < len(stamps):
-        raise InputError(f"{path}: expected different times, got one twice")
+        raise InputError(f"{path}: expected different times, got one twice; drop either image")
     if stamps is None:
         lines = places
     else:

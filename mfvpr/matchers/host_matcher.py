@@ -90,9 +90,9 @@ class HostMatcher:
     def __post_init__(self) -> None:
         check_fields(self)
         if not self.name:
-            raise InputError("name='': expected the name of the program and its weights, by which a cache knows them")
+            raise InputError("name='': expected the name of the program and its weights, for the cache; set it")
         if self.image_size is not None and self.inputs == "features":
-            raise InputError(f"image_size={self.image_size}: expected None with inputs='features'")
+            raise InputError(f"image_size={self.image_size}: expected None with inputs='features'; leave it out")
 
     def open(self, queries: Side, database: Side) -> "_CalledPairs":
         return _CalledPairs(self, queries, database)

@@ -306,7 +306,7 @@ def _peaks(scores: Float[Array, "height width"]) -> Bool[Array, "height width"]:
 
 
 def _local_maximum(values: Array) -> Array:
-    """Maximum layers.around each pixel. Slices along each axis are faster than a window reduction."""
+    """Maximum around each pixel. Slices along each axis are faster than a window reduction."""
     lowest = False if values.dtype == bool else -jnp.inf
     for axis, size in enumerate(values.shape):
         margin = [(0, 0), (0, 0)]
@@ -318,7 +318,7 @@ def _local_maximum(values: Array) -> Array:
 
 
 def _refine(score_map: Array, row: Array, column: Array) -> Float[Array, "slots 2"]:
-    """Mean position (x, y) px layers.around each peak, weighted by a softmax of the scores."""
+    """Mean position (x, y) px around each peak, weighted by a softmax of the scores."""
     height, width = score_map.shape
     reach = jnp.arange(2 * RADIUS + 1)
     padded = jnp.pad(score_map, RADIUS)

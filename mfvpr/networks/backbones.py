@@ -83,7 +83,7 @@ def _pool_relu(x: Array, pool: Pool) -> Array:
 def require_position(size: tuple[int, int]) -> None:
     """Raise an InputError if images of this (width, height) px are too small for the last block."""
     if min(size) < STRIDE:
-        raise InputError(f"image_size={list(size)}: expected {STRIDE} x {STRIDE} px or more")
+        raise InputError(f"image_size={list(size)}: expected {STRIDE} x {STRIDE} px or more; enlarge the images")
 
 
 class SsmVgg(nnx.Module):

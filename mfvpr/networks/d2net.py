@@ -43,7 +43,7 @@ class D2Net(nnx.Module):
 def _repeats(images: layers.Images) -> Bool[Array, ""]:
     """Whether two neighbors in a map of any image have equal receptive fields, as in a white sky.
 
-    The map is constant there, but rounding can create peaks. layers.Pixels outside the images count as equal.
+    The map is constant there, but rounding can create peaks. Pixels outside the images count as equal.
     """
     batch, height, width, _ = images.shape
     rows, columns = -(-height // STRIDE), -(-width // STRIDE)
@@ -55,8 +55,8 @@ def _repeats(images: layers.Images) -> Bool[Array, ""]:
         same = jnp.pad(same, ((0, 0), (0, missing[0]), (0, missing[1])), constant_values=True)
         same = jnp.all(same.reshape(batch, rows, STRIDE, columns, STRIDE), axis=(2, 4))
         for axis in (1, 2):
-            padding = [(-before, after) if axis == other else (0, 0) for other in range(3)]
-            window = [after - before + 1 if axis == other else 1 for other in range(3)]
+            padding = [(-before, after) if dimension == axis else (0, 0) for dimension in range(3)]
+            window = [after - before + 1 if dimension == axis else 1 for dimension in range(3)]
             same = lax.reduce_window(same, True, lax.bitwise_and, window, (1, 1, 1), padding)
         repeats |= jnp.any(same)
     return repeats
@@ -84,7 +84,7 @@ def extract(
     scales: Sequence[float] = (1.0,),
     share: float = 1.0,
 ) -> tuple[layers.Detections, ...]:
-    """Keypoints of images: one layers.Detections per scale, each with a leading axis `batch`.
+    """Keypoints of images: `Detections` for each scale, each with a leading axis `batch`.
 
     Args:
         images: RGB, 0 .. 255, at least 12 px high and wide at every scale.

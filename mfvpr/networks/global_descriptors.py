@@ -172,7 +172,8 @@ class MixVPR(nnx.Module):
     def __call__(self, images: layers.Images) -> Float[Array, "batch dimensions"]:
         """Descriptors of unit length, channels times rows, from preprocessed images of 320 x 320 px."""
         if images.shape[1:3] != IMAGE_SIZE[::-1]:
-            raise ValueError(f"MixVPR takes images of 320 x 320 px only, got {images.shape[2]} x {images.shape[1]}")
+            got = f"{images.shape[2]} x {images.shape[1]} px; resize them"
+            raise ValueError(f"MixVPR: expected images of 320 x 320 px, got {got}")
         return self.aggregate(self.backbone(images))
 
     def aggregate(self, maps: Float[Array, "batch 20 20 1024"]) -> Float[Array, "batch dimensions"]:

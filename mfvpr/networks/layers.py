@@ -253,5 +253,5 @@ def between(dense: Float[Array, "..."], places: Neighbors, axis: int) -> Float[A
 
     Reading two neighbors is several times faster than a product with the sparse matrix of the interpolation.
     """
-    part = jnp.expand_dims(places.part, [other for other in range(dense.ndim) if other != axis % dense.ndim])
+    part = jnp.expand_dims(places.part, [each for each in range(dense.ndim) if each != axis % dense.ndim])
     return (1 - part) * jnp.take(dense, places.lower, axis) + part * jnp.take(dense, places.upper, axis)

@@ -79,8 +79,9 @@ class EvaluationReport:
         """
         truth, rows = self.truth, list[dict[str, Any]]()
         if truth is None:
-            names = self.ranked.systems
-            return [{"system": name, "decides": name == self.headline, "recall_at": {}} for name in names]
+            parts = [{"sequence": sequence.name} for sequence in self.sequences] if len(self.sequences) > 1 else [{}]
+            systems = [{"system": name, "decides": name == self.headline} for name in self.ranked.systems]
+            return [system | part | {"recall_at": {}} for system in systems for part in parts]
         for system, recall in self.ranked.recall(self.thresholds, self.ks).items():
             parts = dict(zip((sequence.name for sequence in self.sequences), recall.by_sequence, strict=True))
             if len(parts) > 1:
@@ -136,7 +137,7 @@ class EvaluationReport:
     def probabilities(self) -> dict[str, Float[np.ndarray, "2 queries"]]:
         """Confidence by system, of the queries as they are, and without the images of their place.
 
-        Without `confidences`, each half of the path has those of a fit on the other, without what shows places of both.
+        Without `confidences`, each half of the path has those of a fit on the other half, without places of both.
         NaN without a prediction, or without anything to fit on.
         """
         names = self.calibration if self.confidences is None else self.confidences

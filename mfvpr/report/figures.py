@@ -33,7 +33,8 @@ from mfvpr.utils.errors import InputError
 from mfvpr.utils.files import clip_middle, path_inside, printable, replacing, require_replaceable
 
 ABOUT: tuple[str, ...] = ("system", "sequence", "outcome", "query", "prediction")  # keywords in the file of a figure
-_AGREES, _DIFFERS = "#2fa8ff", "#ff9a1f"  # told apart by color-blind people as well
+REFUSED = "refused"  # the outcome of a query with a first candidate, but no place
+_AGREES, _DIFFERS = "#2fa8ff", "#ff9a1f"  # which color-blind people can distinguish
 _SOFTWARE = b"mfvpr.report"  # at the start of every PNG file
 _MATCHES = 30  # drawn, the heaviest, as in the paper
 _GAP = 12  # px between the two images
@@ -159,9 +160,9 @@ def query_figures(report: EvaluationReport, shown: int | Sequence[int]) -> list[
     figures: list[Figure] = []
     for place in range(len(report.sequences)):
         drawings, folder = SequenceFigures(report, place), report.folder(Path(), place).name
-        for query, verdict in drawings.verdicts(shown).items():
-            name = (Path(folder) / f"{verdict}_{query:04d}.png").as_posix()
-            figures.append((name, partial(drawings.draw, query=query, verdict=verdict)))
+        for query, outcome in drawings.outcomes(shown).items():
+            name = (Path(folder) / f"{outcome}_{query:04d}.png").as_posix()
+            figures.append((name, partial(drawings.draw, query=query, outcome=outcome)))
     return figures
 
 
@@ -177,31 +178,35 @@ class SequenceFigures:
         self._correct = None if positives is None else report.correct[headline][part]
         self._positives = None if positives is None else positives.take(part)
 
-    def verdicts(self, selection: int | Sequence[int]) -> dict[int, str]:
-        """Verdicts of queries that get a figure: the selected rows, or so many, half of them correct if known."""
-        has_prediction = self._ranked.rows[:, 0] >= 0
-        words = ["best"] if self._correct is None else ["correct", "incorrect"]
-        is_first = np.ones(len(has_prediction), bool) if self._correct is None else self._correct[:, 0]
-        verdicts = np.where(is_first, words[0], words[-1])
-        if not isinstance(selection, int):
-            return {query: str(verdicts[query]) for query in selection if has_prediction[query]}
-        chosen: dict[int, str] = {}
-        for word, numbers in zip(words, np.array_split(range(selection), len(words)), strict=True):
-            queries = np.flatnonzero(has_prediction & (verdicts == word))
-            spread = np.linspace(0, len(queries) - 1, min(len(numbers), len(queries))).round().astype(int)
-            chosen |= dict.fromkeys(queries[spread].tolist(), word)
-        return chosen
+    def outcomes(self, selection: int | Sequence[int]) -> dict[int, str]:
+        """Outcomes of queries that get a figure: the selected rows, or so many, half of them correct if known.
 
-    def draw(self, path: Path, query: int, verdict: str) -> None:
-        """Draw the prediction, and below an incorrect one a correct one."""
-        candidates = [self._candidate(query, 0, verdict)]
-        candidates += self.correct_candidates(query) if verdict == "incorrect" else []
-        sequence, headline, reason = self._sequence, self._report.headline, self._reasons[query]
+        Halves are by the first candidate, also of a query that is refused.
+        """
+        words = ["best"] if self._correct is None else ["correct", "incorrect"]
+        by_candidate = np.where(True if self._correct is None else self._correct[:, 0], words[0], words[-1])
+        outcomes = np.where(self._ranked.rows[:, 0] >= 0, by_candidate, "")  # "": without a candidate
+        if isinstance(selection, int):
+            chosen, numbers = list[int](), np.array_split(range(selection), len(words))
+            for word, part in zip(words, numbers, strict=True):
+                queries = np.flatnonzero(outcomes == word)
+                spread = np.linspace(0, len(queries) - 1, min(len(part), len(queries))).round().astype(int)
+                chosen += queries[spread].tolist()
+        else:
+            chosen = [query for query in selection if outcomes[query]]
+        return {query: REFUSED if self._reasons[query] else str(outcomes[query]) for query in chosen}
+
+    def draw(self, path: Path, query: int, outcome: str) -> None:
+        """Draw the first candidate, and below an incorrect one a correct one."""
+        is_incorrect = self._correct is not None and not self._correct[query, 0]
+        candidates = [self._candidate(query, 0, outcome)]
+        candidates += self.correct_candidates(query) if is_incorrect else []
+        sequence, headline, truth = self._sequence, self._report.headline, self._sequence.truth
         name, prediction = sequence.images.names[query], self._database.names[self._ranked.rows[query, 0]]
-        within = "" if sequence.truth is None else " at" + threshold_words(sequence.truth.unit, self._report.threshold)
-        note = f" (no place: {reason})" if reason else ""
-        title = f"{headline}, {verdict}{within}: {_short(name)} -> {_short(prediction)}{note}"
-        about = dict(zip(ABOUT, (headline, sequence.name, verdict, name, prediction), strict=True))
+        words = "" if truth is None else " at" + threshold_words(truth.unit, self._report.threshold)
+        words = f" ({self._reasons[query]})" if outcome == REFUSED else words
+        title = f"{headline}, {outcome}{words}: {_short(name)} -> {_short(prediction)}"
+        about = dict(zip(ABOUT, (headline, sequence.name, outcome, name, prediction), strict=True))
         original = sequence.images.read(query)
         histogram_figure(path, self._resize(original), candidates, title=title, original=original, about=about)
 
@@ -216,16 +221,16 @@ class SequenceFigures:
         row = nearest if nearest is not None and nearest in rows else int(rows[0])
         return [self._shown(row, "correct", f"not among the {self._ranked.rows.shape[1]} candidates")]
 
-    def _candidate(self, query: int, rank: int, verdict: str) -> Candidate:
+    def _candidate(self, query: int, rank: int, outcome: str) -> Candidate:
         """The candidate at a rank from 0."""
         row, score = int(self._ranked.rows[query, rank]), self._ranked.scores[query, rank]
         place = int(np.flatnonzero(self._matched.candidates.indices[query] == row)[0])
         pair = jax.tree.map(lambda values: values[place], self._matched.matches[0][query])
         explanation = explain(self._report.histogram or HistogramOfShifts(), pair)
-        return self._shown(row, verdict, f"rank {rank + 1}, score {score:.5g}", pair, explanation)
+        return self._shown(row, outcome, f"rank {rank + 1}, score {score:.5g}", pair, explanation)
 
-    def _shown(self, row: int, verdict: str, words: str, *matched: Any) -> Candidate:
-        caption = f"{verdict}: {_short(self._database.names[row])}, {words}"
+    def _shown(self, row: int, outcome: str, words: str, *matched: Any) -> Candidate:
+        caption = f"{outcome}: {_short(self._database.names[row])}, {words}"
         return Candidate(self._resize(self._database.read(row)), caption, *matched)
 
     def _resize(self, image: np.ndarray) -> np.ndarray:

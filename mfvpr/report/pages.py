@@ -22,8 +22,8 @@ from mfvpr.evaluation.confidence import PrecisionRecall
 from mfvpr.evaluation.rankings import RETRIEVAL
 from mfvpr.evaluation.statistics import Estimate, estimate, mcnemar, path_test
 from mfvpr.io.containers import reading
-from mfvpr.report.evaluations import sequence_folder
-from mfvpr.report.figures import ABOUT
+from mfvpr.report.evaluations import NO_PLACE, sequence_folder
+from mfvpr.report.figures import ABOUT, REFUSED
 from mfvpr.report.runs import LAST, Table, file_names, format_estimate, format_interval, read_csv, table_of
 from mfvpr.utils.errors import InputError
 from mfvpr.utils.files import require_replaceable, write_text
@@ -36,7 +36,7 @@ _PICTURE_WIDTH, _QUALITY = 1000, 75  # px, of JPEG: some 60 kB each
 _POLICY = b"default-src 'none'; script-src "  # at the start of every page
 _TEMPLATES = Path(__file__).parent / "templates"
 _EXPECTED = "expected the run folder of an evaluation of this version"
-_NAMELESS = "folder"  # the default name of a data set of own folders
+_NAMELESS = "folder"  # the default name of a data set
 _CURVE_POINTS = 200
 _POOLED = MEANS[-1]
 _OUTCOMES = {"1": "correct", "0": "incorrect", "": "best"}  # by `correct` of predictions
@@ -138,16 +138,20 @@ class Run:
         """The first candidates of all systems for each query that has one, those of the system that decides first.
 
         A row has texts: `system`, `sequence`, `query`, `prediction`, `score`; `outcome`, which is "correct",
-        "incorrect", or "best" without ground truth; and the rank of the `first_correct`, empty without one.
+        "incorrect", "best" without ground truth, or "refused" if the system that decides predicts no place; and the
+        rank of the `first_correct`, empty without one.
         """
         systems, files = sorted(self.systems, key=lambda name: name != self.headline), file_names(self.systems)
         for system, (number, sequence) in itertools.product(systems, enumerate(self.sequences)):
-            folder = sequence_folder(self.folder, self.sequences, number) / "predictions"
-            rows = read_csv(folder / f"{files[system]}.csv")
+            folder = sequence_folder(self.folder, self.sequences, number)
+            rows = read_csv(folder / "predictions" / f"{files[system]}.csv")
+            decided = read_csv(folder / "predictions.csv") if system == self.headline else []
+            refused = {row["query"] for row in decided if row["database"] == NO_PLACE}
             ranks = {row["query"]: row["rank"] for row in reversed(rows) if row["correct"] == "1"}
             for row in rows:
                 if row["rank"] == "1":
                     outcome, rank = _OUTCOMES[row["correct"]], ranks.get(row["query"], "")
+                    outcome = REFUSED if row["query"] in refused else outcome
                     about = {"system": system, "sequence": sequence, "outcome": outcome, "first_correct": rank}
                     yield {"query": row["query"], "prediction": row["database"], "score": row["score"], **about}
 
@@ -190,8 +194,8 @@ def write_report(folder: Path, path: Path | None = None) -> Path:
         pictures, predictions = run.pictures(), [*itertools.islice(run.predictions(), MOST_PREDICTIONS + 1)]
     per_query = 1 / max(common["queries"], 1)
     seconds = [[stage, f"{value:.3f}", f"{value * per_query:.4f}"] for stage, value in common["seconds"].items()]
-    made = {name: run.about.get(name) for name in ("command", "commit")}
-    made |= {name.replace("_", " "): common[name] for name in ("ground_truth", "data_fingerprint")}
+    provenance = {name: run.about.get(name) for name in ("command", "commit")}
+    provenance |= {name.replace("_", " "): common[name] for name in ("ground_truth", "data_fingerprint")}
     skipped = run.tables.get("skipped", [])
     title, dataset = common["dataset"], run.about["settings"]["dataset"]
     if title == _NAMELESS and isinstance(dataset.get("queries"), str):  # the ends of the paths of its folders
@@ -207,7 +211,7 @@ def write_report(folder: Path, path: Path | None = None) -> Path:
         is_cut=len(predictions) > MOST_PREDICTIONS,
         seconds=Table(["stage", "seconds", "per query"], seconds),
         run=run,
-        made=made,
+        provenance=provenance,
         systems={row["system"]: row["parameters"] for row in run.results},
         skipped=skipped and table_of(skipped, [*skipped[0]]),
         **recall,
@@ -233,7 +237,7 @@ def write_comparison(folders: Sequence[Path], path: Path) -> None:
         about = {name: run.about.get(name) for name in ("command", "commit", "settings", "ground_truth")}
         about |= {name: run.common[name] for name in ("data_fingerprint", "versions", "seconds")}
         settings[label] = dict(flat(about))
-    header, recall = ["run", "data set", "decides", "what was evaluated"], dict[str, Any]()
+    header, recall = ["run", "data set", "decides", "description"], dict[str, Any]()
     if known := {label: run for label, run in runs.items() if run.queries}:
         recall = _recall(known, {f"{label}: {run.headline}": (run, run.headline) for label, run in known.items()})
     names = dict.fromkeys(name for values in settings.values() for name in values)
@@ -242,7 +246,7 @@ def write_comparison(folders: Sequence[Path], path: Path) -> None:
         path,
         "comparison.html",
         title=f"{', '.join(dict.fromkeys(run.common['dataset'] for run in runs.values()))}: {len(runs)} runs compared",
-        words="The systems that decide, beside each other; each run has a page of its own.",
+        words="The systems that decide, beside each other; each run also has a page.",
         facts=facts,
         runs=Table(header, overview, text_columns=4),
         differing=Table(["name", *settings], [row for row in rows if len({*row[1:]}) > 1], 1 + len(settings)),
@@ -261,8 +265,8 @@ def _write_search_page(folder: Path, results: Mapping[str, Any], path: Path) -> 
         tables = {caption: table_of(rows, [*rows[0]][:1])}
     title, _, words = heading.partition(": ")
     settings = {name: value for name, value in results.items() if name not in _IN_TABLES}
-    found = {"text": summary.removeprefix(heading).strip(), "images": figures, "tables": tables}
-    parts = {"Results": found} | ({"Settings and versions": {"tables": {"Run": settings}}} if settings else {})
+    content = {"text": summary.removeprefix(heading).strip(), "images": figures, "tables": tables}
+    parts = {"Results": content} | ({"Settings and versions": {"tables": {"Run": settings}}} if settings else {})
     write_page(path, title=title, words=words, facts={}, parts=parts)
 
 
@@ -314,8 +318,8 @@ def _depths_chart(curves: Curves) -> Chart:
 
 def _tolerance_chart(curves: Curves) -> Chart:
     """Recall of all queries over the threshold, of the runs with several thresholds in the unit of the first."""
-    points, (run, _) = dict[str, list[tuple[float, float]]](), next(iter(curves.values()))
-    unit, k = run.common["ground_truth"]["unit"], min(run.common["recall_at"], key=int)
+    points, (first, _) = dict[str, list[tuple[float, float]]](), next(iter(curves.values()))
+    unit, k = first.common["ground_truth"]["unit"], min(first.common["recall_at"], key=int)
     for name, (run, system) in curves.items():
         if len(run.thresholds) > 1 and run.common["ground_truth"]["unit"] == unit and k in run.common["recall_at"]:
             rows = [row for row in run.results if row["system"] == system]
@@ -344,19 +348,20 @@ def _precision_chart(curves: Curves, by: str) -> Chart:
 def _differences(curves: Curves) -> dict[str, Table]:
     """Tests of every two curves, query by query, and the pairs that cannot be compared."""
     rows, incomparable = [], []
-    for (name, (run, system)), (other, (second, other_system)) in itertools.combinations(curves.items(), 2):
-        differing = {
-            "other images": run.common["data_fingerprint"] != second.common["data_fingerprint"],
-            "another ground truth": run.common["ground_truth"] != second.common["ground_truth"],
-            "other queries": (run.queries, run.sequences) != (second.queries, second.sequences),
+    for names in itertools.combinations(curves, 2):
+        (run1, system1), (run2, system2) = (curves[name] for name in names)
+        reasons = {
+            "other images": run1.common["data_fingerprint"] != run2.common["data_fingerprint"],
+            "another ground truth": run1.common["ground_truth"] != run2.common["ground_truth"],
+            "other queries": (run1.queries, run1.sequences) != (run2.queries, run2.sequences),
         }
-        if any(differing.values()):
-            incomparable.append([name, other, next(words for words, differs in differing.items() if differs)])
+        if any(reasons.values()):
+            incomparable.append([*names, next(reason for reason, holds in reasons.items() if holds)])
             continue
-        hits = run.hits(system), second.hits(other_system)
+        hits = run1.hits(system1), run2.hits(system2)
         test, path = mcnemar(*hits), path_test(*hits)
         numbers = (f"{value:.2g}" for value in (test.p_value, *path))
-        rows.append([name, other, str(test.only_first), str(test.only_second), *numbers])
+        rows.append([*names, str(test.only_first), str(test.only_second), *numbers])
     header = ["system", "other", "only system", "only other", "McNemar p", "queries worth one", "p along the path"]
-    reasons = Table(["run", "other", "why"], incomparable, text_columns=3)
-    return {"differences": Table(header, rows, text_columns=2), "incomparable": reasons}
+    pairs = Table(["run", "other", "why"], incomparable, text_columns=3)
+    return {"differences": Table(header, rows, text_columns=2), "incomparable": pairs}

@@ -146,11 +146,11 @@ def format_estimate(estimate: tuple[float, tuple[float, float]]) -> str:
 
 
 @contextmanager
-def claim_run_folder(folder: Path, *, numbered: bool = False, own: bool = False) -> Iterator[Path]:
+def claim_run_folder(folder: Path, *, numbered: bool = False, is_exclusive: bool = False) -> Iterator[Path]:
     """Make and lock a new or empty folder, until the block or the process ends; it is removed if it is still empty.
 
-    If `numbered`, `folder-2`, `folder-3`, ... stand in for one that exists. If only runs write into it (`own`), files
-    of a killed run are removed. An InputError if it cannot be written to, is not empty, or if another run uses it.
+    If `numbered`, `folder-2`, `folder-3`, ... stand in for one that exists. If only runs write into it, `is_exclusive`,
+    files of a killed run are removed. An InputError if it cannot be written to, is not empty, or another run uses it.
     """
     first, above = folder, [parent for parent in folder.absolute().parents if not parent.exists()]
     if folder.is_symlink() or folder.is_file():
@@ -168,7 +168,7 @@ def claim_run_folder(folder: Path, *, numbered: bool = False, own: bool = False)
                 stack.enter_context(lock_folder(folder, in_use))
             paths = [*folder.iterdir()]
             names = {path.name for path in paths} - {_UNFINISHED}
-            if names and (not own or LAST in names):  # the folder stays as it is
+            if names and (not is_exclusive or LAST in names):  # the folder stays as it is
                 raise InputError(f"{folder}: expected a new or empty run folder; name another")
             for path in paths:  # of a run that was killed
                 shutil.rmtree(path) if path.is_dir() and not path.is_symlink() else path.unlink()

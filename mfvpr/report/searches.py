@@ -160,8 +160,8 @@ def sweep_summary(outcome: Outcome, heading: str) -> str:
         parts.append(f"chosen: {format_values(outcome.settings[outcome.chosen[0]])}")
         parts.append("chosen and reported on the same queries, so this flatters; split=both does not")
     parts.append("Recall at 1 in %, with 95 % intervals in brackets:")
-    for threshold, _, chosen, own, test, path in outcome.report:
-        recalls = f"chosen {format_estimate(chosen)}, own values {format_estimate(own)}"
+    for threshold, _, chosen, unswept, test, path in outcome.report:
+        recalls = f"chosen {format_estimate(chosen)}, own values {format_estimate(unswept)}"
         counts = f"only one of them correct: {test.only_first} and {test.only_second} queries"
         probabilities = f"McNemar p = {test.p_value:.2g}, along the path p = {path.p_value:.2g}"
         parts.append(f"{protocol.label(1, threshold)}: {recalls}; {counts}, {probabilities}")
@@ -196,11 +196,8 @@ def sweep_figures(outcome: Outcome) -> list[Figure]:
     names = [name for name, axis in outcome.axes.values.items() if len(axis) > 1 and outcome.is_grid]
     pairs = list(itertools.combinations(names, 2)) or [("", name) for name in names]
     files = runs.file_names([" + ".join(filter(None, pair)) for pair in pairs[:_MAX_HEAT_MAPS]]).values()
-
-    figures = list[Figure]()
-    for pair, file in zip(pairs, files, strict=False):
-        figures.append((f"{file}.png", lambda path, pair=pair: save_figure(_heat_map(outcome, *pair), path)))
-    return figures
+    draw = lambda path, pair: save_figure(_heat_map(outcome, *pair), path)  # noqa: E731
+    return [(f"{file}.png", partial(draw, pair=pair)) for pair, file in zip(pairs, files, strict=False)]
 
 
 def _heat_map(outcome: Outcome, first: str, second: str) -> Canvas:
@@ -226,9 +223,9 @@ def _heat_map(outcome: Outcome, first: str, second: str) -> Canvas:
     panel.set(xlabel=second, ylabel=first)
     corner = best[second] - 0.5, best[first] - 0.5
     panel.add_patch(Rectangle(corner, 1, 1, linewidth=2.5, fill=False, edgecolor=_MARK))
-    own = {"": ""} | {name: format_value(value) for name, value in axes.own_values.items()}
-    if own[first] in words[first] and own[second] in words[second]:
-        place = words[second].index(own[second]), words[first].index(own[first])
+    unswept = {"": ""} | {name: format_value(value) for name, value in axes.own_values.items()}
+    if unswept[first] in words[first] and unswept[second] in words[second]:
+        place = words[second].index(unswept[second]), words[first].index(unswept[first])
         panel.plot(*place, marker="o", markersize=30, markerfacecolor="none", markeredgecolor=_MARK)
     fixed = [f"{name} = {words[name][place]}" for name, place in best.items() if name not in ("", first, second)]
     panel.set_title("; ".join([f"{_label(outcome)} in %", *fixed]), fontsize=9, parse_math=False)

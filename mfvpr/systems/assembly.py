@@ -15,7 +15,7 @@ from typing import Any, Literal
 from mfvpr import features, retrieval
 from mfvpr.baselines.learned_weight import SUFFIX, WORDS, named_weight
 from mfvpr.baselines.scorers import SCORERS
-from mfvpr.checkpoints import REGISTRY, load_model, own_entries
+from mfvpr.checkpoints import REGISTRY, custom_entries, load_model
 from mfvpr.core import Scorer
 from mfvpr.core.scorer import parameters_of
 from mfvpr.core.weights import WEIGHTS
@@ -178,6 +178,8 @@ def _check_choice(group: str, prefix: str, values: Any) -> None:
     if group == "scorer" and isinstance(values.get("weight"), list) and "weight" in known:
         known = {**known, "weight": replace(known["weight"], rule=list_of(known["weight"].rule))}
     check_values(known, without(values, key), f"{prefix}.")
+    if missing := [name for name in known if name not in values]:
+        raise InputError(f"{prefix}.{missing[0]}: expected a value of {choice}, got none")
 
 
 @dataclass(frozen=True)
@@ -223,22 +225,24 @@ class SystemSettings:
             _check_choice("retrieval", "retrieval" if "name" in self.retrieval else f"retrieval.{name}", values)
         if not 1 <= len(by_retrieval(self.retrieval)) <= 2:
             raise InputError(f"retrieval: expected one or two, got {', '.join(self.retrieval) or 'none'}")
+        if not self.scorer:
+            raise InputError("scorer: expected at least one, got none")
         for name, values in by_scorer(self.scorer).items():
             _check_choice("scorer", "scorer" if "method" in self.scorer else f"scorer.{name}", values)
-        local = self.features
-        if self.scorer.get("method") == "grid":  # which takes the cells of features in a square grid
+        local, scorers = self.features, by_scorer(self.scorer).values()
+        for grid in (values for values in scorers if values["method"] == "grid"):  # of cells of features in a square
             if local["name"] not in ("ssm", "import") and self.matching["name"] != "import":
                 raise InputError(f"scorer=grid: expected features=ssm, whose features are cells, got {local['name']}")
             check = self.matching.get("cross_check", self.matching["name"])
             if check != "candidate":
                 raise InputError(f"matching.cross_check={check}: expected candidate, so that every cell has a match")
             cells = [(-(-pixels // 8) - 3) // local.get("stride", 1) + 1 for pixels in local["image_size"] or []]
-            if local["name"] == "ssm" and cells != [self.scorer["side"]] * 2:
-                raise InputError(f"scorer.side={self.scorer['side']}: expected the {cells} cells of the images")
+            if local["name"] == "ssm" and cells != [grid["side"]] * 2:
+                raise InputError(f"scorer.side={grid['side']}: expected the {cells} cells of the images")
         if local["name"] == "patch_netvlad":  # of whose patches the scorer `rapid` takes the largest place
             sides = local["image_size"]
             largest = [[16 * (pixels // 16 - patch) for pixels in sides] for patch in local["patch_sizes"]]
-            for values in by_scorer(self.scorer).values():
+            for values in scorers:
                 size = values.get("size")
                 if size is not None and [[*size]] != largest:
                     raise InputError(f"scorer.size={size}: expected the patches' largest place, {largest[0]}, or null")
@@ -274,7 +278,7 @@ def retriever(
         return retrieval.ShortlistFiles(files, settings["database_prefix"])
     if name == "ssm":
         return retrieval.SsmVoting(_network_extractor("retrieval", name, options))
-    search, standardize = EXACT, settings.get("standardize", "none")  # of maps of earlier versions
+    search, standardize = EXACT, settings.get("standardize", "none")
     if settings["whiten"] is not None:
         search = retrieval.WhitenedSearch(settings["whiten"])
         if standardize not in ("none", "auto"):
@@ -312,7 +316,7 @@ def _network_extractor(group: str, name: str, settings: Mapping[str, Any]) -> An
 
 def _network(group: str, names: tuple[str, ...], weights: str) -> Any:
     """A network of one of these names, with its converted weights."""
-    known = [entry.name for entry in (*REGISTRY.values(), *own_entries()) if entry.network in names]
+    known = [entry.name for entry in (*REGISTRY.values(), *custom_entries()) if entry.network in names]
     if weights not in known:
         raise InputError(f"{group}.weights={weights}: expected weights of {names[0]}: one of {', '.join(known)}")
     return load_model(weights)
@@ -350,9 +354,8 @@ def _files(group: str, settings: Mapping[str, Any], data: Dataset | None) -> dic
         root, path = sequence.images.root, expand_user(queries[index if len(queries) > 1 else 0])
         file = File(path, settings["query_prefix"])
         if files.setdefault(root, file) != file:
-            raise InputError(
-                f"{group}.queries={path}: expected file and prefix of {group}.database, both are of {root}"
-            )
+            expected = f"file and prefix of {group}.database, both are of {root}"
+            raise InputError(f"{group}.queries={path}: expected {expected}")
     return files
 
 

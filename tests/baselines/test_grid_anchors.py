@@ -80,7 +80,7 @@ def test_other_keypoints_than_the_cells_of_the_grid_score_nan(change):
 
 def test_matches_without_indices_and_impossible_grids_raise():
     pair = replace(cells(np.arange(9), 3), index1=None)
-    with pytest.raises(InputError, match="expected matches that know their keypoints"):
+    with pytest.raises(InputError, match="expected matches with index0 and index1"):
         GridAnchors(3)(pair)
     for options, line in (
         ({"side": 0}, "side=0: expected a whole number from 1"),

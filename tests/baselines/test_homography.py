@@ -132,13 +132,51 @@ def test_no_homography_explains_a_line_or_a_point(points1, points0):
     assert not np.asarray(estimated.inliers).any()
 
 
-@pytest.mark.parametrize("far", [1e5, 1e7, 1e9, 1e20])
+@pytest.mark.parametrize("far", [1e5, 1e7, 1e9, 1e20, 1e30, 1e37])  # the square of the last three overflows
 def test_far_points_do_not_make_inliers_of_the_others(far):
     rng = np.random.default_rng(0)
     points1, points0 = rng.uniform(0, SIZE, (2, 60, 2))
     points0[:30] = points1[:30] + 5
     points1[-1], points0[-1] = far, (far, -far)
-    assert float(estimate(Homography(8.0), make_matches(points0, points1, capacity=CAPACITY)).score) <= 34
+    matches = make_matches(points0, points1, capacity=CAPACITY)
+    for scorer in (Homography(8.0), Homography(8.0, refit=True)):
+        estimated = estimate(scorer, matches)
+        assert 30 <= float(estimated.score) <= 34
+        assert not estimated.inliers[59]
+
+
+INVERSION = jnp.array([0.0, 0, 1, 0, 1, 0, 1, 0, 0])  # (x, y) -> (1 / x, y / x): the line x = 0 maps to infinity
+
+
+def test_points_at_infinity_are_no_inliers():
+    singular = jnp.array([1.0, 0, 0, 0, 1, 0, 1, 0, 0])  # (0, 0) has no image at all
+    points = jnp.array([[0.0, 0, 0.5, 0.5], [0, 0.5, 0.5, 0.5], [0, 0, 0, 0], [2, 1, 0.5, 0.5]])
+    for threshold in (0.0, 0.1, 1e30):
+        within = jax.jit(homography.is_inlier)(INVERSION, points, jnp.float32(threshold))
+        assert within.tolist() == [False, False, False, True]
+        assert not homography.is_inlier(singular, points[:3], jnp.float32(threshold)).any()
+        both = jnp.stack([INVERSION, singular], axis=1)  # many models and one match
+        assert not homography.is_inlier(both, points[0], jnp.float32(threshold)).any()
+
+
+@pytest.mark.parametrize("start", [INVERSION, jnp.array([1.0, 0, 0, 0, 1, 0, 0.5, 0, 1])])
+def test_points_at_infinity_stay_out_of_the_least_squares(start):
+    """Without weight; one of them is at infinity in each model, one is padding."""
+    rng = np.random.default_rng(0)
+    points1 = rng.uniform(0.5, 1, (20, 2))
+    points0 = ransac_oracle.mapped(np.asarray(start, float).reshape(3, 3), points1) + rng.normal(0, 0.01, (20, 2))
+    at_infinity = [[0, 0.5, 1, 1], [-2, 0, 1, 1], [np.nan] * 4]
+    points = jnp.asarray(np.concatenate([np.concatenate([points1, points0], axis=1), at_infinity]), jnp.float32)
+    weights = jnp.asarray(np.arange(23) < 20, jnp.float32)
+    model = np.asarray(homography.least_squares(start, points, weights), float)
+    before, after = (
+        np.sum((ransac_oracle.mapped(each.reshape(3, 3), points1) - points0) ** 2)
+        for each in (np.asarray(start, float), model)
+    )
+    assert np.isfinite(model).all()
+    assert after < 0.95 * before
+    matrix = homography.Frame(jnp.zeros(4), jnp.ones(2)).to_pixels(start)
+    assert np.isfinite(matrix).all()
 
 
 def test_a_match_counts_with_its_confidence():

@@ -45,8 +45,8 @@ def file(tmp_path):
 def test_to_the_last_bit(file, names):
     weight = LearnedWeight.create(jax.random.key(1), MATCHES, 3, names=names)
     write_weight(file, weight, PROVENANCE)
-    got, made = read_weight(file)
-    assert (got.names, made) == (names, PROVENANCE)
+    got, provenance = read_weight(file)
+    assert (got.names, provenance) == (names, PROVENANCE)
     jax.tree.map(np.testing.assert_array_equal, got, weight)
     assert {leaf.dtype for leaf in jax.tree.leaves(got)} == {np.dtype("float32")}
     with pytest.raises(ValueError, match="not JSON compliant"):

@@ -43,8 +43,8 @@ PARAMETERS = 157
 
 
 def tiny_entry(name: str = "tiny", **changes: object) -> networks.Entry:
-    entry = networks.Entry(name, "tiny", "tiny.pth", "https://example.org/tiny.pth", None, None, "MIT", "none stated")
-    return replace(entry, **{"file": f"{name}.pth"} | changes)
+    source, licenses = (f"{name}.pth", "https://example.org/tiny.pth", None, None), ("MIT", "none stated")
+    return replace(networks.Entry(name, "tiny", *source, *licenses, lambda: Tiny, TABLE), **changes)
 
 
 @pytest.fixture
@@ -52,7 +52,6 @@ def folder(tmp_path, monkeypatch):
     """Folder of the weights; `tiny` is registered, not installed."""
     monkeypatch.setenv("MFVPR_WEIGHTS", str(tmp_path / "weights"))
     monkeypatch.setitem(networks.REGISTRY, "tiny", tiny_entry())
-    monkeypatch.setitem(networks.NETWORKS, "tiny", networks.Network(lambda: Tiny, TABLE))
     return tmp_path / "weights"
 
 

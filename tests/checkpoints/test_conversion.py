@@ -7,8 +7,8 @@ import pytest
 
 from mfvpr.checkpoints import REGISTRY, entry_of
 from mfvpr.checkpoints.checkpoint import read_checkpoint
-from mfvpr.checkpoints.conversion import Table, convert
-from mfvpr.checkpoints.networks import NETWORKS, blueprint
+from mfvpr.checkpoints.conversion import SSM, Table, convert
+from mfvpr.checkpoints.networks import plan_network
 from mfvpr.utils import InputError
 from tests import random_checkpoints as checkpoints
 from tests.checkpoints.conftest import PARAMETERS, SHAPES, SOURCE_SHAPES, TABLE, tiny_entry
@@ -96,7 +96,7 @@ def test_filled_twice(source):
 
 
 def test_a_blueprint_can_be_filled_twice(folder, arrays):
-    plan = blueprint(tiny_entry())
+    plan = plan_network(tiny_entry().builder())
     assert dict(plan.shapes) == SHAPES
     assert plan.parameters == PARAMETERS
     first = plan.build(arrays)
@@ -111,8 +111,8 @@ def test_a_blueprint_can_be_filled_twice(folder, arrays):
 )
 def test_published_layouts_fit_the_networks(name):
     """Each parameter of the network comes from one key of the checkpoint."""
-    plan = blueprint(entry_of(name))
-    parameters = convert(vacant(PUBLIC[name]), NETWORKS[name].table, plan.shapes)
+    plan = plan_network(entry_of(name).builder())
+    parameters = convert(vacant(PUBLIC[name]), entry_of(name).table, plan.shapes)
     assert parameters.keys() == plan.shapes.keys()
 
 
@@ -124,7 +124,7 @@ def vacant(shapes):
 def test_vgg16_of_other_classes_is_not_that_of_places365():
     source = vacant(places365_shapes() | {"fc8a_1.weights": (1000, 4096), "fc8a_1.bias": (1000,)})
     with pytest.raises(InputError, match=r"weights .*: expected \(365, 4096\), got \(1000, 4096\)"):
-        convert(source, NETWORKS["vgg16_places365"].table, blueprint(entry_of("vgg16_places365")).shapes)
+        convert(source, SSM, plan_network(entry_of("vgg16_places365").builder()).shapes)
 
 
 @needs(ALIKED, LIGHTGLUE)
@@ -135,15 +135,14 @@ def test_real_weights_are_the_registrys_and_convert(name):
     content = file.read_bytes()
     assert len(content) == entry.size
     assert hashlib.sha256(content).hexdigest() == entry.sha256
-    plan = blueprint(entry)
-    parameters = convert(read_checkpoint(file), NETWORKS[name].table, plan.shapes)
+    plan = plan_network(entry.builder())
+    parameters = convert(read_checkpoint(file), entry.table, plan.shapes)
     assert parameters.keys() == plan.shapes.keys()
     assert all(np.isfinite(array).all() for array in parameters.values())
 
 
 def test_registry():
     assert len({entry.file for entry in REGISTRY.values()}) == len(REGISTRY)
-    assert NETWORKS.keys() == REGISTRY.keys()
     hashes = [entry.sha256 for entry in REGISTRY.values() if entry.sha256]
     assert len(set(hashes)) == len(hashes) == 12
     assert all(len(digest) == 64 and int(digest, 16) for digest in hashes)

@@ -84,7 +84,7 @@ def test_a_crash_leaves_nothing_that_looks_complete(folder, arrays, save_tiny):
 
 @pytest.mark.parametrize("name", ["../tiny", "unknown"])
 def test_unknown_names(folder, name):
-    with pytest.raises(InputError, match="no weights of this name"):
+    with pytest.raises(InputError, match="expected the name of published weights"):
         load(name)
 
 

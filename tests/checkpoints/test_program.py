@@ -57,7 +57,7 @@ def tiny_checkpoint(tmp_path):
         (["add", "some.pth"], "some.pth: no such file"),
         (["add", "some.pth", "--as", "d2_tff"], "the nearest is d2_tf"),
         (["add", "nowhere/d2_tf.pth"], "nowhere/d2_tf.pth: expected a checkpoint file"),
-        (["verify", "d2"], "d2: no weights of this name; "),
+        (["verify", "d2"], "d2: expected the name of published weights; "),
         (["download", "d2_tf"], "d2_tf: no hash is published"),
         (["download", "vgg16_places365"], "get vgg16_places365.npy from https://imr.ciirc.cvut.cz/uploads/"),
     ],
@@ -137,8 +137,8 @@ def test_weights_of_ones_own_are_never_taken_for_the_published_ones(
     assert not folder.exists()
     code, stdout, stderr = program("add", tiny_checkpoint, "--own", "mine")
     assert (code, stderr) == (0, "")
-    own = f"own/mine, {PARAMETERS} parameters, your own for the network of tiny; use it as weights=own/mine\n"
-    assert stdout == f"{folder}/own/mine.safetensors: {own}"
+    message = f"own/mine, {PARAMETERS} parameters, your own for the network of tiny; use it as weights=own/mine\n"
+    assert stdout == f"{folder}/own/mine.safetensors: {message}"
     converted = tiny_checkpoint.with_name("converted.safetensors")
     (folder / "own" / "mine.safetensors").rename(converted)
     assert program("add", converted, "--own", "mine", "--as", "tiny")[0] == 0

@@ -1,6 +1,7 @@
 """mfvpr convert: files of other programs from an evaluation and from localized images."""
 
 import json
+import shutil
 from pathlib import Path
 
 import pytest
@@ -38,7 +39,7 @@ def first_candidates(run):
 
 
 @pytest.mark.parametrize("layout", ["preds", "hloc", "kapture"])
-def test_candidates_of_a_run(convert, settings, layout):
+def test_candidates_of_a_run(convert, settings, layout, tmp_path):
     dataset = dataset_of(settings.dataset)
     path, stdout, _ = convert(settings.out, layout)
     assert stdout == f"{path}: candidates of {len(dataset.queries)} queries\n"
@@ -57,6 +58,11 @@ def test_candidates_of_a_run(convert, settings, layout):
         assert lines[1] == str(dataset.queries.paths[4])
         positives = lines[lines.index("Positives paths:") + 1 : -1]
         assert positives == [str(dataset.database.paths[row]) for row in correct]
+        run = shutil.copytree(settings.out, tmp_path / "run")  # as if images beside the queries had been left out
+        about = (run / "run.json").read_text()
+        (run / "run.json").write_text(about.replace('"exclude_neighbors": null', '"exclude_neighbors": 1'))
+        path, *_ = convert(run, layout, out="left_out")
+        assert (path / "004.txt").read_text().splitlines() == lines[: lines.index("Positives paths:")]
 
 
 def poses_of(dataset, path, num_numbers):

@@ -16,7 +16,7 @@ from mfvpr.cli import evaluation, jobs
 from mfvpr.datasets import AllowedTruth, Positives
 from mfvpr.evaluation import mcnemar
 from mfvpr.report import runs
-from mfvpr.report.figures import SequenceFigures
+from mfvpr.report.figures import SequenceFigures, query_figures
 from mfvpr.utils.errors import InputError
 from tests.programs import CANDIDATES, QUERIES, ROOT, composed, csv_rows, settings_of, small
 
@@ -166,7 +166,27 @@ def test_figures_of_chosen_queries(outcome):
     for incorrect in (24, -1, "nope.png"):
         with pytest.raises(InputError, match=r"rows .*0 to 23, .*0000"):
             query_rows([0, incorrect], dataset)
-    assert list(page_of(outcome).verdicts([5, 2])) == [5, 2]
+    assert list(page_of(outcome).outcomes([5, 2])) == [5, 2]
+
+
+def test_figures_of_refused_queries_say_so(outcome, tmp_path, monkeypatch):
+    correct, drawn = outcome.report.correct["histogram"], []
+    first, second = (int(np.flatnonzero(correct[:, 0] == hit)[0]) for hit in (True, False))
+    refuses = {"histogram": lambda ranked: np.where(np.isin(np.arange(QUERIES), [first, second]), 0.1, 0.9)}
+    report = replace(outcome.report, confidences=refuses, least_confidence=0.5)
+    page, words = SequenceFigures(report, 0), {True: "correct", False: "incorrect"}
+    expected = {query: words[bool(hit)] for query, hit in enumerate(correct[:, 0])}
+    assert page.outcomes([*range(QUERIES)]) == expected | {first: "refused", second: "refused"}
+    assert page.outcomes(4).keys() == page_of(outcome).outcomes(4).keys()
+    draw_pair = lambda _, image, candidates, **words: drawn.append((len(candidates), words))  # noqa: E731
+    monkeypatch.setattr("mfvpr.report.figures.histogram_figure", draw_pair)
+    figures = {name: draw for name, draw in query_figures(report, [first, second])}
+    assert [*figures] == [f"refused_{query:04d}.png" for query in (first, second)]
+    for draw in figures.values():
+        draw(tmp_path / "figure.png")
+    assert [count for count, _ in drawn] == [1, 2]  # below an incorrect candidate, a correct one
+    assert [words["about"]["outcome"] for _, words in drawn] == ["refused"] * 2
+    assert all("histogram, refused (low confidence): " in words["title"] for _, words in drawn)
 
 
 # --- the claim ---------------------------------------------------------------------------------------------------

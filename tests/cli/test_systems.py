@@ -1,7 +1,10 @@
 """Systems by name in the library are those of the programs."""
 
+import functools
 import json
+import math
 import sys
+from contextlib import nullcontext
 
 import numpy as np
 import pytest
@@ -9,10 +12,13 @@ import pytest
 import mfvpr
 from mfvpr import InputError, load_system
 from mfvpr.cli import evaluation, jobs, programs
-from mfvpr.features import AlikedFeatures, Sift
+from mfvpr.cli.schema import Evaluate
+from mfvpr.features import AlikedFeatures, Sift, SsmCells
 from mfvpr.storage import FeatureCache
 from mfvpr.systems.assembly import CONF
+from mfvpr.utils.fields import from_values
 from mfvpr.utils.fingerprints import recipe_of
+from tests.io.checks import one_line_error
 from tests.programs import CANDIDATES, composed, csv_rows, settings_of, small
 
 FEATURES = {"max_keypoints": 60, "image_size": [160, 120]}
@@ -23,9 +29,7 @@ SMALL = {"features": FEATURES, "retrieval": {"num_words": 8}, "candidates": CAND
 def test_every_system_loads_or_names_the_weights_to_install(name, tmp_path, monkeypatch):
     monkeypatch.setenv("MFVPR_WEIGHTS", str(tmp_path))
     if name == "steering":
-        with pytest.warns(
-            UserWarning, match="^system=steering uses SIFT, because .* mfvpr weights download aliked-n16$"
-        ):
+        with pytest.warns(UserWarning, match="^system=steering uses SIFT .* mfvpr weights download aliked-n16$"):
             assert isinstance(load_system(name).pipeline.extractor, Sift)
     else:
         with pytest.raises(InputError, match=r"^[\w-]+: not installed in "):
@@ -61,6 +65,34 @@ def test_what_cannot_be_loaded_is_one_line(name, settings, words):
     with pytest.raises(InputError, match=words) as error:
         load_system(name, **settings)
     assert "\n" not in str(error.value)
+
+
+def test_a_run_json_of_another_program_or_that_lacks_a_setting_is_one_line(tmp_path):
+    """A default in its place may be another value than that of the run."""
+    path = tmp_path / "run.json"
+    contents = {"cannot be read": {"model": "resnet"}, "lr: unknown setting": {"settings": {"lr": 0.1}}}
+    for name in ("features.image_size", "retrieval.num_words", "scorer.histogram.sigma", "scorer"):
+        *groups, last = name.split(".")
+        lacking = contents[f"{name}: expected .* got none$"] = {"settings": composed()}
+        del functools.reduce(dict.__getitem__, groups, lacking["settings"])[last]
+    for words, content in contents.items():
+        path.write_text(json.dumps(content))
+        with one_line_error(f"^{path}: {words}"):
+            load_system(path)
+
+
+@pytest.mark.parametrize("stride", [1, 2, 3])
+@pytest.mark.parametrize("size", [[224, 224], [304, 144], [144, 304], [337, 330], [330, 100]])
+def test_the_side_of_the_grid_is_that_of_the_cells_whatever_their_number(size, stride):
+    """36 x 16 cells are as many as 24 x 24; also of one score of several."""
+    settings = composed("system=ssm_vpr", f"features.image_size={size}", f"features.stride={stride}")
+    rows, columns = SsmCells(None, tuple(size), stride=stride).windows.grid
+    for side in {rows, columns, math.isqrt(rows * columns)}:
+        grid = settings["scorer"] | {"side": side}
+        for scorer in (grid, {"it": grid, "count": composed()["scorer"]["count"]}):
+            words = rf"^scorer.side={side}: expected the \[{columns}, {rows}\] cells"
+            with nullcontext() if rows == columns else one_line_error(words):
+                from_values(Evaluate, settings | {"scorer": scorer})
 
 
 @pytest.mark.slow

@@ -9,12 +9,12 @@ from PIL import Image
 
 from mfvpr import InputError, datasets
 from mfvpr.datasets import IndexFile, image_folder
-from mfvpr.datasets.contents import contents, own_rows
+from mfvpr.datasets.contents import contents, identical_rows
 from tests.builders import fill
 from tests.io.checks import one_line_error
 
 
-@pytest.mark.parametrize(("name", "words"), [("no", "got nothing"), ("empty", "found none"), ("file", "a file")])
+@pytest.mark.parametrize(("name", "words"), [("no", "got nothing"), ("empty", "got none"), ("file", "a file")])
 def test_missing_and_empty_folders(tmp_path, name, words):
     (tmp_path / "empty").mkdir()
     (tmp_path / "file").write_text("")
@@ -47,10 +47,10 @@ def test_linked_folders_are_followed(tmp_path):
 @pytest.mark.parametrize(
     ("place", "target", "words"),
     [
-        ("sub/back", "..", "back: a link back to "),
+        ("sub/back", "..", "back: expected files and folders, got a link back to "),
         ("sub/up", "../..", "a link back to "),
-        ("self", "self", "self: a link to nothing"),
-        ("gone", "nowhere", "gone: a link to nothing"),
+        ("self", "self", "self: expected an image or a folder, got a link to nothing"),
+        ("gone", "nowhere", "gone: expected an image or a folder, got a link to nothing"),
     ],
 )
 def test_links_in_circles_or_to_nothing_are_errors(tmp_path, place, target, words):
@@ -102,26 +102,26 @@ def sequence(tmp_path):
     return folder
 
 
-def dataset_and_own_rows(database, queries, ground_truth="none"):
+def dataset_and_identical_rows(database, queries, ground_truth="none"):
     dataset = datasets.folder(database, queries, ground_truth=ground_truth)
-    return dataset, own_rows(contents(dataset.queries), contents(dataset.database))
+    return dataset, identical_rows(contents(dataset.queries), contents(dataset.database))
 
 
 def test_the_same_images_are_known_by_content(sequence, tmp_path):
-    assert dataset_and_own_rows(sequence, sequence)[1] == tuple((row,) for row in range(6))
+    assert dataset_and_identical_rows(sequence, sequence)[1] == tuple((row,) for row in range(6))
     other = tmp_path / "other"
     other.mkdir()
     for name, source in (("b.png", "4.png"), ("a.png", "1.png")):
         shutil.copy(sequence / source, other / name)
     Image.new("RGB", (4, 4), (99, 0, 0)).save(other / "c.png")
     shutil.copy(sequence / "1.png", sequence / "5.png")  # the robot stood still
-    assert dataset_and_own_rows(sequence, other)[1] == ((1, 5), (4,), ())
+    assert dataset_and_identical_rows(sequence, other)[1] == ((1, 5), (4,), ())
     (sequence / "6.png").symlink_to("nowhere")
-    assert dataset_and_own_rows(sequence, sequence)[1][6] == ()  # files that cannot be read are not the same
+    assert dataset_and_identical_rows(sequence, sequence)[1][6] == ()  # files that cannot be read are not the same
 
 
 def test_neighbors_are_neither_candidates_nor_correct(sequence):
-    dataset, rows = dataset_and_own_rows(sequence, sequence, "order")
+    dataset, rows = dataset_and_identical_rows(sequence, sequence, "order")
     for neighbors in (0, 1):
         allowed = np.abs(np.arange(6)[:, None] - np.arange(6)) > neighbors
         reduced = dataset.only.without_neighbors(6, rows, neighbors)
@@ -129,12 +129,12 @@ def test_neighbors_are_neither_candidates_nor_correct(sequence):
         expected = dataset.truth.positives(2).dense() & allowed
         np.testing.assert_array_equal(reduced.truth.positives(2).dense(), expected)
     assert not reduced.truth.positives(1).rows.size  # all correct images are excluded
-    assert dataset_and_own_rows(sequence, sequence)[0].only.without_neighbors(6, rows, 0).truth is None
+    assert dataset_and_identical_rows(sequence, sequence)[0].only.without_neighbors(6, rows, 0).truth is None
 
 
 def test_two_sequences_have_no_neighbors(sequence, tmp_path):
     (tmp_path / "other").mkdir()
     Image.new("RGB", (4, 4), (99, 0, 0)).save(tmp_path / "other" / "0.png")
-    dataset, rows = dataset_and_own_rows(sequence, tmp_path / "other")
+    dataset, rows = dataset_and_identical_rows(sequence, tmp_path / "other")
     with pytest.raises(InputError, match=r"exclude_neighbors=2: expected .*database images"):
         dataset.only.without_neighbors(6, rows, 2)

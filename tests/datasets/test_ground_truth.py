@@ -1,6 +1,7 @@
 """Ground truth of every kind, and its faults."""
 
 import json
+import tracemalloc
 
 import numpy as np
 import pytest
@@ -8,12 +9,13 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from mfvpr import InputError, datasets
-from mfvpr.datasets import AllowedTruth, FrameTruth, IndexFile, LabelFiles, Positives, RadiusTruth
+from mfvpr.datasets import AllowedTruth, FrameTruth, IndexFile, LabelFiles, Positives, RadiusTruth, radius_positives
 from mfvpr.datasets.ground_truth import threshold_words
 from mfvpr.utils.files import write_text
 from tests import oracles
 from tests.builders import fill
 from tests.io.checks import one_line_error
+from tests.shapes import unchecked_shapes
 
 
 @pytest.fixture
@@ -131,6 +133,44 @@ def test_a_radius_is_a_loop_over_all_pairs(seed, radius):
     np.testing.assert_array_equal(truth.positives(radius).dense(), oracles.radius_positives(queries, database, radius))
 
 
+@pytest.mark.parametrize("dtype", ["u1", "i1", "u4", "i8", "u8", "f4"])
+def test_positions_of_any_numbers_do_not_wrap_around(dtype):
+    queries, database = np.array([[3, 100]], dtype), np.array([[103, 0], [3, 99], [0, 104]], dtype)
+    truth = RadiusTruth(queries, database)
+    np.testing.assert_array_equal(truth.distance(0), [np.hypot(100, 100), 1, 5])
+    assert truth.positives(5).of(0).tolist() == [1, 2]
+    np.testing.assert_array_equal(radius_positives(queries, database, radius=5), [[False, True, True]])
+
+
+@pytest.mark.parametrize("first", [np.nan, np.inf, 1e10, "a", 1j, True])
+def test_positions_without_a_meaning_are_errors(first):
+    place, xy = np.zeros((1, 2)), [[first, first]]
+    with unchecked_shapes():
+        for call in (lambda: RadiusTruth(np.array(xy), place), lambda: radius_positives(np.array(xy), place)):
+            with pytest.raises(InputError, match=r"query_xy: expected positions \[1, 2\] .*, got .*; remove images"):
+                call()
+        with pytest.raises(InputError, match=r"database_xy: expected positions \[1, 2\] .*, got float64\[1, 3\]"):
+            RadiusTruth(place, np.zeros((1, 3)))
+
+
+def test_memory_grows_with_the_positives_not_with_all_pairs():
+    xy = np.stack([10.0 * np.arange(50_000), np.zeros(50_000)], axis=1)
+    tracemalloc.start()
+    positives = RadiusTruth(xy, xy).positives(25.0)
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    np.testing.assert_array_equal(positives.counts, [3, 4, *[5] * 49_996, 4, 3])
+    assert positives.of(1500).tolist() == [1498, 1499, 1500, 1501, 1502]  # of the second block
+    assert peak < 2**26  # as float64, all distances would take 20 GB
+
+
+@pytest.mark.parametrize("row", [-1, 3])
+def test_frames_beyond_the_database_are_errors(row):
+    got = f"{min(row, 0)} to {max(row, 0)}"
+    with pytest.raises(InputError, match=f"rows: expected rows of a database of 3 images, got {got}"):
+        FrameTruth(((0,), (), (row,)), 3)
+
+
 @pytest.mark.parametrize("tolerance", [0, 1, 4, 10**6])
 def test_frames_are_a_loop_over_all_pairs(tolerance):
     truth = FrameTruth(((3, 7), (), (0,), (9,), (7, 3, 7, 4), (0, 0)), 10)  # a place that is named twice counts once
@@ -169,7 +209,7 @@ def test_excluded_images_are_not_correct():
         (
             "gt.npz",
             {"utmQ": np.full((2, 2), np.nan), "utmDb": np.zeros((3, 2))},
-            "at most 1e+09 m, got [2, 2] up to nan",
+            "at most 1e+09 m, got float64[2, 2] up to nan",
         ),
         ("gt.npz", {"utmQ": np.zeros(()), "utmDb": np.zeros((3, 2))}, "utmQ: expected positions [2, 2]"),
         ("gt.npz", {"query": np.arange(2), "database": np.arange(3)}, "cannot be read"),

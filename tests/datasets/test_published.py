@@ -102,7 +102,9 @@ def test_faults_of_robotcar(tmp_path):
     centers = {place(condition, 1): (0, 0, 0) for condition in (REFERENCE, *CONDITIONS)}
     write_poses(tmp_path, centers)
     (tmp_path / "images/snow/rear/1.jpg").unlink()
-    check_error("robotcar_seasons", tmp_path, "1 of the 1 images of robotcar_v2_train.txt are missing")
+    check_error(
+        "robotcar_seasons", tmp_path, "expected 1 images of robotcar_v2_train.txt, got all but 1, the first of which"
+    )
     write_poses(tmp_path, {name: center for name, center in centers.items() if "rain" not in name})
     check_error("robotcar_seasons", tmp_path, "expected poses of night-rain/rear, got none")
     for numbers in ("1 2 3", "nan " * 16, "1 0 0 0 0 1 0 0 0 0 1 0 7 7 7 1"):  # the last is transposed
@@ -139,7 +141,7 @@ def test_nordland_takes_the_frames_of_patch_netvlads_lists(tmp_path):
     dataset = published_dataset("nordland_27592", tmp_path)
     assert dataset.database.names == dataset.queries.names == tuple(f"images-{i:05d}.png" for i in (2, 3, 6))
     (tmp_path / "winter/images-00003.png").unlink()
-    check_error("nordland_27592", tmp_path, "1 of the 3 images of nordland_imageNames_query.txt")
+    check_error("nordland_27592", tmp_path, "expected 3 images of nordland_imageNames_query.txt, got all but 1")
 
 
 def test_nordlands_test_part_is_two_sections(tmp_path):

@@ -22,7 +22,7 @@ from mfvpr.evaluation import (
     write_confidences,
 )
 from mfvpr.evaluation.calibration import absent_ranking
-from mfvpr.evaluation.confidence import chance_calibration_error
+from mfvpr.evaluation.confidence import chance_calibration_error, confidence_from_json
 from mfvpr.report.evaluations import EvaluationReport
 from mfvpr.utils import InputError
 
@@ -128,6 +128,19 @@ def test_other_files_are_refused_in_one_line(content, tmp_path):
     assert "\n" not in str(refusal.value)
     with pytest.raises(InputError, match="got nothing"):
         read_confidences(tmp_path / "none.json")
+
+
+MODEL = {"center": [0, 0], "scale": [1, 1], "weights": [0, 1], "bias": 0.5, "refusals": [0.2, 1]}
+
+
+@pytest.mark.parametrize("change", [
+    {"apart": 3}, {"apart": 6}, {"scale": [1, 0]}, {"weights": [0, -1]}, {"refusals": [0, 0.5]}, {"bias": math.inf},
+    {"refusals": [0.2, 1.1]}, {"center": [0, math.nan]}, {"center": [0, 0, 0]}, {"scale": [1]}, {"bias": "1"},
+])  # fmt: skip
+def test_values_of_other_rows_or_versions_make_no_model(change):
+    assert confidence_from_json(MODEL | {"apart": 5}).weights == (0, 1)
+    with pytest.raises((TypeError, ValueError)):
+        confidence_from_json(MODEL | change)
 
 
 def test_halves_of_drives_there_and_back_share_no_place():

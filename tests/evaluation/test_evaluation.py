@@ -10,7 +10,7 @@ import pytest
 
 import mfvpr
 from mfvpr import datasets
-from mfvpr.datasets import IndexFile
+from mfvpr.datasets import IndexFile, Positives
 from mfvpr.evaluation import Fusion, match_sequence
 from mfvpr.evaluation.dataset_ranking import KS
 from mfvpr.evaluation.statistics import path_test
@@ -111,6 +111,13 @@ def test_matches_are_kept_and_read_without_features(dataset, result, tmp_path):
         [ranked], [expected] = system.systems[name], result.systems[name]
         np.testing.assert_array_equal(ranked.rows, expected.rows)
     np.testing.assert_array_equal(first.matched[0].candidates.indices, again.matched[0].candidates.indices)
+
+
+def test_matches_of_other_excluded_images_are_not_taken(dataset, tmp_path):
+    without = replace(dataset, sequences=(replace(dataset.only, excluded=Positives(np.eye(10, dtype=bool))),))
+    for data in (dataset, without, dataset):
+        result = evaluate_parts(data, SIFT, VLAD, SCORERS, candidates=3, cache=FeatureCache(tmp_path))
+        assert (result.systems["count"][0].rows == np.arange(10)[:, None]).any() == (data is dataset)
 
 
 @pytest.fixture(scope="module")

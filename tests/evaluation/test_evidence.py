@@ -8,7 +8,7 @@ import pytest
 
 from mfvpr.core.types import Features, Shortlist
 from mfvpr.datasets.image_reading import read_image, resize
-from mfvpr.evaluation.evidence import evidence_against, reason_against_image
+from mfvpr.evaluation.evidence import evidence_against, reason_against, reason_against_image
 from mfvpr.evaluation.rankings import Ranked
 from mfvpr.evaluation.system import noise_images
 from mfvpr.features.feature_set import strength
@@ -44,6 +44,13 @@ def test_negative_detection_scores_have_no_strength():
     scores = np.array([0.5, -3.0, 0.25], np.float32)
     features = Features(np.zeros((3, 2)), np.zeros((3, 4)), scores, np.ones(3, bool), np.ones(2))
     assert strength(features) == 0.75
+
+
+def test_the_least_evidence_is_enough():
+    """Eight matches, and a score of 1.2 times that of noise, which may be unknown."""
+    for score, noise in ((12.0, 10.0), (0.0, 0.0), (np.nan, 10.0), (1.0, np.nan)):
+        assert (reason_against(8, score, noise), reason_against(7, score, noise)) == (None, "too few matches")
+    assert reason_against(8, 11.99, 10.0) == "no better than noise"
 
 
 def test_the_evidence_is_that_of_the_prediction_whatever_the_order_of_the_retrieval():

@@ -12,7 +12,7 @@ import mfvpr
 from mfvpr import balancing_c, combine
 from mfvpr.core.types import Shortlist
 from mfvpr.evaluation import FrameCorrelation, Fusion, match_sequence, stages
-from mfvpr.evaluation.rankings import fuse_scales, rank_by_scores, rank_shortlist
+from mfvpr.evaluation.rankings import fuse_scales, rank_by_scores, rank_shortlist, retrieval_scores
 from mfvpr.utils import InputError
 from tests import oracles
 from tests.evaluation.conftest import SCORERS, SIFT, VLAD
@@ -51,6 +51,11 @@ def test_standardized_scores_are_summed():
     fused = Fusion("zscore", "negative_euclidean", {"a": 3.0})("a", candidates, scores)  # retrieval counts 1
     distance = -np.sqrt(2 - 2 * candidates.scores.astype(np.float64))
     assert_fused(fused, candidates, [distance, scores["a"]], [1.0, 3.0])
+
+
+def test_the_distance_of_a_cosine_that_rounding_lifts_above_1_is_0():
+    candidates = Shortlist(np.array([[4, 2]]), np.float32([[1.0009, 0.5]]), np.ones((1, 2), bool))
+    np.testing.assert_allclose(retrieval_scores(candidates, "negative_euclidean"), [[0, -1]], atol=1e-6)
 
 
 @pytest.mark.parametrize("unit", ["a", "b"])

@@ -1,5 +1,7 @@
 """The protocol of choosing and reporting, against loops over queries."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -102,6 +104,17 @@ def test_positions_are_reported_along_their_path_however_names_sort_them(split):
     changes = np.flatnonzero(np.diff(hits.astype(int)))
     assert hits.sum() == 25
     assert len(changes) == 1  # neighbors of the street are neighbors
+
+
+def test_reported_sets_stay_apart_each_along_its_path():
+    """Sets are joined behind the queries that are learned on, whatever places they share."""
+    positions = np.stack([10.0 * np.random.default_rng(0).permutation(12), np.zeros(12)], axis=1)
+    protocol = evaluation_protocol(RadiusTruth(positions, positions), [12.0])
+    order = replace(protocol, reported_sets={"b": 4, "c": 5}).order
+    for start, end in ((0, 3), (3, 7), (7, 12)):
+        assert sorted(order[start:end]) == [*range(start, end)]
+        along = positions[order[start:end], 0]
+        assert along.tolist() in (sorted(along), sorted(along, reverse=True))
 
 
 PLACES = 60

@@ -11,8 +11,7 @@ from experiments.benchmark import accelerator_checks, networks, scores
 from experiments.benchmark.benchmarks import THOUSAND, run
 from experiments.benchmark.harness import torch_or_none
 from mfvpr import InputError
-from mfvpr.checkpoints.conversion import SELAVPR
-from mfvpr.checkpoints.networks import NETWORKS, Network
+from mfvpr.checkpoints import REGISTRY
 from mfvpr.networks import SelaVpr
 from tests.needs import skip_without
 from tests.programs import output_of
@@ -103,7 +102,8 @@ def results(tmp_path_factory):
     contests = [each._replace(size=SIZES.get(each.checkpoint, (160, 128))) for each in contests]
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("MFVPR_WEIGHTS", str(tmp_path_factory.mktemp("weights")))
-        patch.setitem(NETWORKS, "selavpr_msls", Network(lambda: partial(SelaVpr, 128, 2, 2), SELAVPR))  # narrow
+        narrow = replace(REGISTRY["selavpr_msls"], builder=lambda: partial(SelaVpr, 128, 2, 2))
+        patch.setitem(REGISTRY, "selavpr_msls", narrow)
         yield {(step, name): call() for step, name, call in networks.network_entries(contests, (2,))}
     torch.set_num_threads(threads)
 

@@ -9,7 +9,7 @@ import pytest
 
 from mfvpr import Features, InputError
 from mfvpr.features import FeatureSet
-from mfvpr.features.feature_set import KEPT, WRITTEN, Slots, memory_budget, stack_features
+from mfvpr.features.feature_set import RESIDENT, WRITTEN, Slots, memory_budget, stack_features
 from tests.builders import make_features
 
 DEVICE = jax.devices()[0]
@@ -174,7 +174,7 @@ def test_slots_and_what_is_on_its_way_stay_within_the_budget():
         assert 0.45 * min(budget, total_bytes) < taken < 1.25 * total_bytes
         assert taken + 6 * largest < budget + 6 * WRITTEN * (224 + 32) * KEYPOINT  # of each capacity, `WRITTEN` rows
         again = [slots.stage(part) for part in slots.parts(rows)]
-        assert any(part.new for part in again) == (share < 1 / KEPT)
+        assert any(part.new for part in again) == (share < 1 / RESIDENT)
 
 
 def test_rows_are_written_by_one_program_for_each_capacity(compilations):

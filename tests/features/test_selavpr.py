@@ -1,12 +1,12 @@
 """SelaVPR as a system, DINOv2 as retriever and features, by name, with weights converted from files; small networks."""
 
+from dataclasses import replace
 from functools import partial
 
 import numpy as np
 import pytest
 
-from mfvpr.checkpoints import networks
-from mfvpr.checkpoints.conversion import DINOV2, SELAVPR
+from mfvpr.checkpoints import REGISTRY
 from mfvpr.networks import SelaVpr, VisionTransformer
 from tests.features.conftest import read_rows
 from tests.random_checkpoints import dinov2_shapes, random_checkpoint, selavpr_shapes, write_zip
@@ -27,9 +27,9 @@ def program(run_program, street_settings, tmp_path, monkeypatch):
     monkeypatch.setenv("MFVPR_CACHE", str(tmp_path / "cache"))
     for name, registers in (("selavpr_pitts30k", 0), ("selavpr_msls", 0), ("selavpr_msls_registers", 4)):
         build = partial(SelaVpr, 64, 1, 1, registers=registers)
-        monkeypatch.setitem(networks.NETWORKS, name, networks.Network(lambda build=build: build, SELAVPR))
-    build = partial(VisionTransformer, 64, 1, 1)
-    monkeypatch.setitem(networks.NETWORKS, "dinov2_vits14", networks.Network(lambda: build, DINOV2))
+        monkeypatch.setitem(REGISTRY, name, replace(REGISTRY[name], builder=lambda build=build: build))
+    small = replace(REGISTRY["dinov2_vits14"], builder=lambda: partial(VisionTransformer, 64, 1, 1))
+    monkeypatch.setitem(REGISTRY, "dinov2_vits14", small)
 
     def run(kind, *more, code=0):
         settings = () if kind == "weights" else (*street_settings, f"out={tmp_path}/out")

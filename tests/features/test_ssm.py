@@ -138,7 +138,7 @@ def test_what_has_no_cells_or_has_not_seen_the_database_is_refused(model, cells)
         SsmCells(model, (48, 16))
     with pytest.raises(InputError, match="stride=0"):
         SsmCells(model, stride=0)
-    with pytest.raises(InputError, match="SsmCells: has not seen the database; take"):
+    with pytest.raises(InputError, match="SsmCells: expected a learned whitening, got settings; call"):
         cells(np.zeros((1, 40, 48, 3), np.uint8))
     with pytest.raises(InputError, match=r"SsmCells: .*whitening .*4608 .*got .*41472"):
         replace(cells, whitening=Whitening(np.zeros(41472), np.zeros((3, 41472))))(np.zeros((1, 40, 48, 3), np.uint8))
@@ -147,7 +147,7 @@ def test_what_has_no_cells_or_has_not_seen_the_database_is_refused(model, cells)
 # What is learned
 
 
-def kept(root):
+def whitening_files(root):
     return sorted(root.glob("*whitening*/*/*.npz"))
 
 
@@ -163,14 +163,14 @@ def test_what_is_learned_is_kept_and_made_once(cells, learned, dataset, tmp_path
     assert fit_to_database(again, dataset.database, FeatureCache()) is again
     np.testing.assert_array_equal(again.whitening.components, first.whitening.components)
     np.testing.assert_array_equal(learned.whitening.mean, first.whitening.mean)
-    [path] = kept(tmp_path)
+    [path] = whitening_files(tmp_path)
     assert {*np.load(path).files} == {"mean", "components"}
 
 
 def test_it_is_of_no_other_data_network_or_settings(model, cells, dataset, tmp_path):
     cache, how, other = FeatureCache(tmp_path), cells.whitening, published(1)
     extractors = [fit_to_database(cells, folder, cache) for folder in (dataset.database, dataset.queries)]
-    assert len(kept(tmp_path)) == 2
+    assert len(whitening_files(tmp_path)) == 2
     assert not np.array_equal(*(extractor.whitening.components for extractor in extractors))
     # A hash of it is part of all that is computed with it.
     recipes = [cache.recipes.of_folder(dataset.database, extractor) for extractor in extractors]
@@ -213,7 +213,7 @@ def test_images_that_cannot_be_read_are_left_out_only_where_they_may_be(cells, d
     folder = ImageFolder(tmp_path, dataset.database.names[:3])
     with pytest.raises(InputError, match=r"0001\.png: .*cannot be read .*skip"):
         fit_to_database(cells, folder, FeatureCache(tmp_path / "strict"))
-    assert not kept(tmp_path / "strict")
+    assert not whitening_files(tmp_path / "strict")
     learned = fit_to_database(cells, folder, FeatureCache(tmp_path / "s", skip_bad=True))
     few = fit_to_database(cells, ImageFolder(tmp_path, (folder.names[0], folder.names[2])), FeatureCache())
     np.testing.assert_array_equal(learned.whitening.components, few.whitening.components)
@@ -249,7 +249,7 @@ def test_the_only_votes_of_the_nearest_windows_are_an_images_own(model, dataset,
     retriever = SsmVoting(SsmWindows(model, whitening=WindowFitting(20)))
     [candidates] = retriever.shortlist(sequence, few, 1, FeatureCache(tmp_path)).candidates.indices
     assert candidates == [1]
-    assert len(kept(tmp_path)) == 1
+    assert len(whitening_files(tmp_path)) == 1
     pipeline = mfvpr.Pipeline(RETRIEVAL.describer.extractor, retriever, candidates=3)
     matched = match_sequence(replace(dataset, database=few), sequence, pipeline)
     np.testing.assert_array_equal(matched.candidates.scores.sum(1), [36 * 3])

@@ -91,7 +91,7 @@ def test_written_and_read(tmp_path, descriptors, suffix, half):
         ("g.npz", {"descriptors": np.ones((3, 8)), "names": ["a", "a", "b"]}, "expected different names, got a twice"),
         ("g.npz", {"descriptors": np.ones((3, 8)), "names": [*NAMES[:2], "x"]}, r"first without is image10\.jpg"),
         ("g.csv", None, r"expected a file named \.npy, \.npz, \.h5, \.hdf5, got \.csv"),
-        ("g.h5", {name: np.ones(8 + place) for place, name in enumerate(NAMES)}, r"with one D, got \[\(8,\), \(9,\)"),
+        ("g.h5", {name: np.ones(8 + place) for place, name in enumerate(NAMES)}, r"one D, got \[\(8,\), \(9,\)"),
     ],
 )
 def test_what_is_refused(tmp_path, file, arrays, message):

@@ -3,9 +3,11 @@
 import os
 import random
 import signal
+import sqlite3
 import subprocess
 import sys
 import time
+from contextlib import closing
 from pathlib import Path
 
 import numpy as np
@@ -14,6 +16,7 @@ import pytest
 from mfvpr import InputError
 from mfvpr.storage.cache_files import round_as_stored
 from mfvpr.storage.maps import FILE, Entry, MapFile
+from tests.io.checks import one_line_error
 from tests.programs import ROOT
 from tests.small_disks import UNSHARE, mount, need_small_disks
 from tests.storage.synthetic_features import assert_same, features_of, run_here
@@ -124,6 +127,18 @@ def test_a_file_of_something_else_is_one_line(tmp_path):
     (tmp_path / FILE).write_bytes(b"no database " * 1000)
     with pytest.raises(InputError, match=r"map\.sqlite: cannot be used \(file is not a database\)"):
         MapFile(tmp_path).part("system")
+
+
+@pytest.mark.parametrize(("change", "words"), [
+    *((f"PRAGMA user_version = {other}", f"expected format 4, got {other}. Build the map again") for other in (3, 5)),
+    ("DELETE FROM entries WHERE row = 1", "row 1 is damaged"),  # else later rows would be other images
+])  # fmt: skip
+def test_another_format_and_a_row_that_was_removed_are_named(tmp_path, change, words):
+    MapFile(tmp_path).write({}, [image_of(row) for row in range(3)])
+    with closing(sqlite3.connect(tmp_path / FILE)) as database, database:
+        database.execute(change)
+    with one_line_error(rf"map\.sqlite: {words}"):
+        [*MapFile(tmp_path).entries(0)]
 
 
 def test_a_map_that_may_only_be_read(tmp_path):

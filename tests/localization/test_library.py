@@ -1,6 +1,7 @@
 """A map as a program of one's own makes, opens and calibrates it."""
 
 import json
+from contextlib import nullcontext
 from dataclasses import replace
 
 import numpy as np
@@ -9,11 +10,13 @@ from PIL import Image
 
 import mfvpr
 from mfvpr import InputError, Map, Route
-from mfvpr.datasets import read_image
+from mfvpr.datasets import FrameTruth, read_image
+from mfvpr.evaluation import Ranked
+from mfvpr.evaluation.dataset_ranking import RankedDataset
 from mfvpr.evaluation.drives import STREETS
 from mfvpr.evaluation.system import noise_images
 from mfvpr.features import VladFitting
-from mfvpr.localization.map_settings import read_settings
+from mfvpr.localization import map_settings
 from mfvpr.storage import FeatureCache
 from mfvpr.storage.maps import MapFile
 from tests.builders import map_system
@@ -36,20 +39,13 @@ def street(small_street, tmp_path_factory):
     return Map.create(tmp_path_factory.mktemp("map") / "map", small_street / "database", small("steering"))
 
 
-def test_a_map_is_opened_by_its_folder_alone(street, small_street):
-    again = Map.open(street.folder)
-    query = small_street / "queries/0003.png"
-    assert again.names == street.names
-    assert again.localize(query) == street.localize(query)
-
-
 def test_a_map_in_the_shape_of_its_images_is_the_same_when_it_is_opened_again(small_street, tmp_path):
     system = small("steering", features={"max_keypoints": 60, "image_size": "auto"})
     with pytest.raises(InputError, match="expected the images of a new map"):
         Map(tmp_path / "map", system)
     known, query = Map.create(tmp_path / "map", small_street / "database", system), small_street / "queries/0003.png"
     assert known.extractor.image_size == (388, 291)
-    assert read_settings(tmp_path / "map")["features"]["image_size"] == [388, 291]
+    assert map_settings.read_settings(tmp_path / "map")["features"]["image_size"] == [388, 291]
     prediction = known.localize(query)
     assert prediction.shift is not None
     for again in (Map.open(tmp_path / "map"), Map(tmp_path / "map", system)):
@@ -57,8 +53,10 @@ def test_a_map_in_the_shape_of_its_images_is_the_same_when_it_is_opened_again(sm
     Image.new("RGB", (50, 90)).save(tmp_path / "tall.png")
     tall = mfvpr.datasets.image_folder(tmp_path)  # the map keeps its size
     assert Map.create(tmp_path / "map", tall, system).extractor.image_size == (388, 291)
-    with pytest.raises(InputError, match=r"made with images of 388 x 291 px, got 20000 pixels"):
-        Map(tmp_path / "map", small("steering", features={"max_keypoints": 60, "image_size": 20000}))
+    for pixels, is_about in ((20_000, False), (80_000, True), (160_000, True), (200_000, False)):
+        refused = pytest.raises(InputError, match=f"made with images of 388 x 291 px, got {pixels} pixels")
+        with nullcontext() if is_about else refused:
+            Map(tmp_path / "map", small("steering", features={"max_keypoints": 60, "image_size": pixels}))
 
 
 def test_an_image_is_located_on_a_route(street, small_street):
@@ -150,11 +148,27 @@ def test_a_map_keeps_its_confidence(small_street, tmp_path):
     assert Map.open(tmp_path, threshold=1).localize(query).reason == "low confidence"
 
 
+@pytest.mark.filterwarnings("ignore:.*calibrate on a longer drive")
+def test_refusals_are_shares_of_images_on_the_map_and_of_images_of_absent_places(dataset, monkeypatch):
+    """Four of six queries are on the map; three of these have candidates further than ten frames from their place."""
+    rows = np.array([[0, 30], [5, 7], [20, 1], [39, 25], [3, 4], [3, 4]])
+    truth = FrameTruth(((0,), (5,), (20,), (39,), (), ()), 40)
+    data, system = replace(dataset, sequences=(replace(dataset.only, truth=truth),)), small("steering")
+    ranked = RankedDataset(data, system, [], {system.headline: [Ranked(rows, np.tile([2.0, 1.0], (6, 1)))]}, {})
+    refused = iter([[[0, 4]], [[1, 3, 5]]])  # of the queries as they are, and without their places
+    lacks = lambda *_: [["blurred" if row in rows else None for row in range(6)] for rows in next(refused)]  # noqa: E731
+    monkeypatch.setattr(map_settings, "rank_dataset", lambda *_, **__: ranked)
+    monkeypatch.setattr(map_settings, "evidence_against", lacks)
+    confidence, fitted = map_settings.fit_on_drive(data, system, None)
+    assert (fitted.num_absent, fitted.correct.tolist()) == (0, [True] * 4 + [False] * 2)
+    assert confidence.refusals == pytest.approx(((1 + 2) / 14, (2 + 5) / 15))
+
+
 def test_a_confidence_belongs_to_its_system(small_street, tmp_path):
     known = Map.create(tmp_path, small_street / "database", small("steering"))
     with pytest.warns(UserWarning, match="calibrate on a longer drive"):
         known.calibrate(small_street / "database", small_street / "queries")
-    settings = read_settings(tmp_path)
+    settings = map_settings.read_settings(tmp_path)
     settings["scorer"]["sigma"] = 30.0
     MapFile(tmp_path).write({"system": json.dumps(settings).encode()})
     with pytest.raises(InputError, match="got that of another system"):

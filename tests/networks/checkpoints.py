@@ -3,7 +3,7 @@
 from functools import partial
 
 from mfvpr.checkpoints.conversion import NETVLAD, convert
-from mfvpr.checkpoints.networks import NETWORKS, plan_network
+from mfvpr.checkpoints.networks import entry_of, plan_network
 from mfvpr.networks import VggNetVlad
 from tests.random_checkpoints import netvlad_shapes, random_checkpoint
 
@@ -16,7 +16,8 @@ def fill(build, table, tensors):
 
 def fill_published(name, tensors):
     """The network of a name in the registry."""
-    return fill(NETWORKS[name].builder(), NETWORKS[name].table, tensors)
+    entry = entry_of(name)
+    return fill(entry.builder(), entry.table, tensors)
 
 
 def fill_netvlad(clusters, outputs, seed=0):

@@ -165,6 +165,21 @@ def test_answers_are_pictures_and_rows(page, several, run):
     assert len([row for row in several.rows if len(row) == 7 and row[5] in ("correct", "incorrect")]) == 60
 
 
+@pytest.mark.parametrize("truth", [True, False])
+def test_refused_queries_are_neither_correct_nor_incorrect(tmp_path, truth):
+    page = Parsed(write_report(write_run(tmp_path / "run", truth=truth, sequences=TWO, refused=(6, 9))))
+    words = {0: "incorrect", 1: "correct"} if truth else dict.fromkeys((0, 1), "best")
+    outcomes = [words[rank == 1] for rank in RANKS[HEADLINE]]
+    outcomes[6] = outcomes[9] = "refused"
+    rows = [row for row in page.rows if len(row) == 7 and row[5] in (*words.values(), "refused")]
+    assert [row[5] for row in rows if row[0] == HEADLINE] == outcomes * 2
+    assert "refused" not in {row[5] for row in rows if row[0] != HEADLINE}  # the system that decides refuses alone
+    assert {row[3] for row in rows if row[5] == "refused"} == {text_on_page(HOSTILE[0]), text_on_page(HOSTILE[-1])}
+    shown = [span["class"] for span in page.of("span") if "outcome" in span.get("class", "")]
+    assert shown.count("outcome refused") == 2 + 4  # pictures and rows
+    assert [image["alt"].split()[0] for image in page.of("img")] == ["correct", "refused"] * 2
+
+
 def test_without_ground_truth_there_are_answers_alone(tmp_path, monkeypatch):
     monkeypatch.setattr(pages, "MOST_PREDICTIONS", 7)
     page = Parsed(write_report(write_run(tmp_path / "run", truth=False)))

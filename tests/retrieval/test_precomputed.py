@@ -5,7 +5,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from mfvpr.datasets import Dataset, ImageFolder, QuerySequence
+from mfvpr.datasets import Dataset, ImageFolder, Positives, QuerySequence
 from mfvpr.io import write_features, write_global_descriptors
 from mfvpr.retrieval import DescriptorFiles, FeatureFiles, ShortlistFiles
 from mfvpr.retrieval.precomputed import File
@@ -104,6 +104,27 @@ def test_folders_share_a_file_with_different_entries_or_images_of_one_path(tmp_p
     same = folder(tmp_path / "link")
     assert read_both(database, same, sides | {same.root: sides[database.root]})
     assert read_both(database, database, sides)
+
+
+@pytest.mark.parametrize("depth", [1, 2, 4])
+def test_candidates_of_a_file_that_are_excluded_leave_their_place_to_those_behind(tmp_path, depth):
+    queries, database = folder(tmp_path / "queries"), folder(tmp_path / "database")
+    pairs = "".join(f"{query}.png {row}.png\n" for query, row in ((0, 1), (0, 0), (0, 2), (1, 1), (2, 2), (2, 0)))
+    (tmp_path / "pairs.txt").write_text(pairs)
+    sequence = QuerySequence("q", queries, None, Positives.from_rows([[1], [1, 2], []], 3))
+    files = ShortlistFiles({queries.root: File(tmp_path / "pairs.txt")})
+    candidates = files.shortlist(sequence, database, depth, FeatureCache()).candidates
+    expected = [(rows + [-1] * 4)[:depth] for rows in ([0, 2], [], [2, 0])]
+    assert (candidates.indices.tolist(), candidates.mask.tolist()) == (expected, (np.array(expected) >= 0).tolist())
+
+
+def test_every_sequence_has_its_file_or_all_have_one(tmp_path):
+    sequences = tuple(QuerySequence(name, folder(tmp_path / name), None) for name in "ab")
+    data = Dataset("d", folder(tmp_path / "db"), sequences)
+    settings = {"name": "pairs", "queries": ["a.txt", "b.txt"], "database_prefix": "", "query_prefix": "q/"}
+    for queries, paths in ((["a.txt", "b.txt"], "ab"), (["a.txt"], "aa"), ("a.txt", "aa")):
+        source = assembly.retriever(settings | {"queries": queries}, SimpleNamespace(), data)
+        assert source.files == {tmp_path / name: File(f"{path}.txt", "q/") for name, path in zip("ab", paths)}  # noqa: B905
 
 
 def test_pairs_within_the_database_are_not_of_queries(tmp_path):

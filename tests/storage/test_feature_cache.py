@@ -94,6 +94,7 @@ def test_other_conversions_give_other_images(tmp_path, change):
     cache, folder = FeatureCache(tmp_path / "s"), image_folder(tmp_path)
     before, after = (cache.recipes.contents(images).keys for images in (folder, replace(folder, **change)))
     assert before != after
+    assert feature_cache.states(folder) != feature_cache.states(replace(folder, **change))  # by which memory knows it
 
 
 def test_what_another_version_decodes_are_other_images(monkeypatch):

@@ -12,7 +12,7 @@ from flax import nnx
 from mfvpr import LightGlueMatcher, value
 from mfvpr.baselines.scorers import SCORERS
 from mfvpr.checkpoints import entry_of
-from mfvpr.checkpoints.networks import blueprint
+from mfvpr.checkpoints.networks import plan_network
 from mfvpr.core.weights import WEIGHTS
 from mfvpr.features import Aggregated, AlikedFeatures, Sift, Vlad, VladFitting
 from mfvpr.matchers import NearestNeighborMatcher
@@ -92,7 +92,7 @@ def test_classes_of_the_library_are_known_by_name_and_fields():
 
 
 def test_a_network_is_known_by_its_weights():
-    plan = blueprint(entry_of("aliked-t16"))
+    plan = plan_network(entry_of("aliked-t16").builder())
 
     def recipe(value):
         weights = {name: np.full(shape, value, np.float32) for name, shape in plan.shapes.items()}

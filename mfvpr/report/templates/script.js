@@ -7,7 +7,7 @@ function sort(button) {
   const header = button.closest("th");
   const body = button.closest("table").tBodies[0];
   const direction = header.getAttribute("aria-sort") === "ascending" ? "descending" : "ascending";
-  for (const other of header.parentNode.children) other.removeAttribute("aria-sort");
+  for (const cell of header.parentNode.children) cell.removeAttribute("aria-sort");
   header.setAttribute("aria-sort", direction);
   const rows = [...body.rows].map((row) => ({ row, text: row.cells[header.cellIndex].textContent.trim().replace(/^-$/, "") }));
   const numbers = rows.every(({ text }) => text === "" || !Number.isNaN(Number(text)));
@@ -43,7 +43,7 @@ function filter() {
 for (const select of filters) select.addEventListener("change", filter);
 if (filters.length) filter();
 
-// On a narrow screen a picture is small until it is asked for.
+// On a narrow screen a picture is small until a click.
 for (const button of document.querySelectorAll(".picture button")) {
   button.addEventListener("click", () => button.setAttribute("aria-pressed", button.getAttribute("aria-pressed") === "false"));
 }
@@ -56,12 +56,12 @@ const theme = document.getElementById("theme");
 function colors() {
   const style = getComputedStyle(document.documentElement);
   const [text, line, card] = ["--text", "--line", "--card"].map((name) => style.getPropertyValue(name).trim());
-  const found = { "font.color": text, "hoverlabel.bgcolor": card, "hoverlabel.font.color": text };
+  const layout = { "font.color": text, "hoverlabel.bgcolor": card, "hoverlabel.font.color": text };
   for (const axis of ["xaxis", "yaxis"]) {
-    found[`${axis}.gridcolor`] = line;
-    found[`${axis}.linecolor`] = line;
+    layout[`${axis}.gridcolor`] = line;
+    layout[`${axis}.linecolor`] = line;
   }
-  return [{ "error_x.color": text }, found];
+  return [{ "error_x.color": text }, layout];
 }
 
 function isDark() {

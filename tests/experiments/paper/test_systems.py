@@ -1,16 +1,20 @@
 """Rows, settings and data sets of the evaluations, and the tables of their numbers."""
 
+import time
 from dataclasses import replace
 from pathlib import Path
 
 import pytest
 
-from experiments.paper import systems
+from experiments.paper import runs, systems
 from experiments.paper.runs import input_fingerprints, lock_output, settings_of
 from experiments.paper.systems import DRAWN, ROWS, Place, missing_weights, places
 from experiments.paper.tables import OVERALL, Evaluations, beside, paper_tables, printed_tables, recalls_of
+from mfvpr import datasets
 from mfvpr.cli.schema import Paper
 from mfvpr.datasets import Dataset, FrameTruth, ImageFolder, QuerySequence
+from mfvpr.datasets.streets import streets_folder
+from mfvpr.features import Sift
 from mfvpr.utils.errors import InputError
 
 pytestmark = pytest.mark.thorough
@@ -215,3 +219,22 @@ def test_rows_that_lack_a_data_set_have_no_mean():
         values |= recalls(SIFT, name, [50.0] * 3)
     averages = tables_of([SIFT, ANCHOR], [*map(make_dataset, names)], values)["averages"]
     assert averages.rows == [["SIFT-hist 50", "-", "-", "-", "50.0", "50.0", "50.0"]]
+
+
+# Seconds
+
+
+def test_seconds_of_a_query_include_its_extraction_and_not_that_of_the_database(monkeypatch, tmp_path):
+    street, described, extract = streets_folder(tmp_path, num_frames=4, image_size=(160, 120)), [], Sift.__call__
+    dataset = datasets.folder(street / "database", street / "queries", ground_truth="order")
+
+    def extract_slowly(self, images):
+        time.sleep(0.2 * len(images))
+        described.append(len(images))
+        return extract(self, images)
+
+    monkeypatch.setattr(Sift, "__call__", extract_slowly)
+    monkeypatch.setattr(runs, "QUERIES", 2)
+    seconds = runs.measure_query(compose("sift_10"), dataset)
+    assert seconds["retrieval"] + seconds["features"] >= 0.2
+    assert sum(described) == 4 + 2 * 2  # the queries twice
