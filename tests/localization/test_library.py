@@ -11,7 +11,7 @@ from PIL import Image
 import mfvpr
 from mfvpr import InputError, Map, Route
 from mfvpr.datasets import FrameTruth, read_image
-from mfvpr.evaluation import Ranked
+from mfvpr.evaluation import Ranked, calibration
 from mfvpr.evaluation.dataset_ranking import RankedDataset
 from mfvpr.evaluation.drives import STREETS
 from mfvpr.evaluation.system import noise_images
@@ -157,9 +157,9 @@ def test_refusals_are_shares_of_images_on_the_map_and_of_images_of_absent_places
     ranked = RankedDataset(data, system, [], {system.headline: [Ranked(rows, np.tile([2.0, 1.0], (6, 1)))]}, {})
     refused = iter([[[0, 4]], [[1, 3, 5]]])  # of the queries as they are, and without their places
     lacks = lambda *_: [["blurred" if row in rows else None for row in range(6)] for rows in next(refused)]  # noqa: E731
-    monkeypatch.setattr(map_settings, "rank_dataset", lambda *_, **__: ranked)
-    monkeypatch.setattr(map_settings, "evidence_against", lacks)
-    confidence, fitted = map_settings.fit_on_drive(data, system, None)
+    monkeypatch.setattr(calibration, "rank_dataset", lambda *_, **__: ranked)
+    monkeypatch.setattr(calibration, "evidence_against", lacks)
+    confidence, fitted = calibration.fit_on_drive(data, system, None)
     assert (fitted.num_absent, fitted.correct.tolist()) == (0, [True] * 4 + [False] * 2)
     assert confidence.refusals == pytest.approx(((1 + 2) / 14, (2 + 5) / 15))
 
