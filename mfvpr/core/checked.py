@@ -291,12 +291,12 @@ def checked_product(rows0: Float[Array, "rows _"], rows1: Float[Array, "rows _"]
     """
     length = _PARTS * (1 << max(0, -(-rows0.shape[1] // _PARTS) - 1).bit_length())
     products = jnp.pad(rows0 * rows1, ((0, 0), (0, length - rows0.shape[1])))
-    # Without the barriers, a product and a sum could become one operation that rounds once.
-    parts = jax.lax.optimization_barrier(products).reshape(len(products), _PARTS, -1)
+    # A compiler that knew that the second term is 0 could make one operation of a product and a sum, which rounds once.
+    bits = jax.lax.bitcast_convert_type(products, jnp.int32) ^ (jnp.sum(rows0[:1]) * 0 == 1).astype(jnp.int32)
+    parts = jax.lax.bitcast_convert_type(bits, jnp.float32).reshape(len(products), _PARTS, -1)
     sums = parts[:, 0]
     for part in range(1, _PARTS):
         sums = sums + parts[:, part]
-    sums = jax.lax.optimization_barrier(sums)
     while sums.shape[1] > 1:
         half = sums.shape[1] // 2
         sums = sums[:, :half] + sums[:, half:]
