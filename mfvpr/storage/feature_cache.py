@@ -274,7 +274,7 @@ class FeatureCache:
                     items = CacheFiles(root, type(extractor).__name__, recipe | {"part": name}, pack, unpack)
                 return Part(folder, items, keys, np.full(len(folder), -1))
 
-            vectors = part("vector", lambda vector: {"vector": np.asarray(vector, np.float32)}, itemgetter("vector"))
+            vectors = part("vector", lambda vector: {"vector": _single_or_half(vector)}, itemgetter("vector"))
             scales = (part(f"scale {at}", pack_features, unpack_features) for at in range(len(extractor.scales)))
             return Descriptions(folder, vectors if extractor.vector_size else None, [*scales], before, {})
 
@@ -316,6 +316,11 @@ def _describe_rows(
     for batch in describe_folder(folder, extractor, rows, bad, skip_bad=skip_bad):
         yield from batch.items()
     yield from bad.items()
+
+
+def _single_or_half(vector: Any) -> np.ndarray:
+    vector = np.asarray(vector)
+    return vector if vector.dtype == np.float16 else np.asarray(vector, np.float32)
 
 
 def _count(item: Any) -> int:

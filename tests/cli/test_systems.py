@@ -12,6 +12,7 @@ import pytest
 import mfvpr
 from mfvpr import InputError, load_system
 from mfvpr.cli import evaluation, jobs, programs
+from mfvpr.cli.command_line import alternate
 from mfvpr.cli.schema import Evaluate
 from mfvpr.features import AlikedFeatures, Sift, SsmCells
 from mfvpr.storage import FeatureCache
@@ -19,7 +20,7 @@ from mfvpr.systems.assembly import CONF
 from mfvpr.utils.fields import from_values
 from mfvpr.utils.fingerprints import recipe_of
 from tests.io.checks import one_line_error
-from tests.programs import CANDIDATES, composed, csv_rows, settings_of, small
+from tests.programs import CANDIDATES, composed, csv_rows, settings_of, shared, small
 
 FEATURES = {"max_keypoints": 60, "image_size": [160, 120]}
 SMALL = {"features": FEATURES, "retrieval": {"num_words": 8}, "candidates": CANDIDATES}
@@ -34,6 +35,35 @@ def test_every_system_loads_or_names_the_weights_to_install(name, tmp_path, monk
     else:
         with pytest.raises(InputError, match=r"^[\w-]+: not installed in "):
             load_system(name)
+
+
+@pytest.mark.parametrize("names", ["[vlad,same]", "[vlad, same]"])
+def test_two_retrievals_are_a_list(names):
+    expected = ["~retrieval", "+retrieval@retrieval.vlad=vlad", "+retrieval@retrieval.same=same"]
+    assert alternate(f"retrieval={names}") == expected
+    assert alternate("retrieval=vlad") == ["retrieval=vlad"]
+    settings = settings_of(*expected, "retrieval.vlad.num_words=8", "retrieval.same.standardize=running")
+    assert settings.retrieval["vlad"]["num_words"] == 8
+    with pytest.raises(InputError, match=r"^retrieval.vlad.standardize=all: expected one of auto"):
+        settings_of(*expected, "retrieval.vlad.standardize=all")
+    with pytest.raises(InputError, match=r"^retrieval: expected one or two, got vlad, same, third"):
+        settings_of(*expected, "+retrieval@retrieval.third=vlad")
+
+
+def test_a_run_says_how_descriptors_were_standardized(tmp_path, tmp_path_factory, capsys):
+    """Two retrievals in turns; the recall without later queries stands behind the heading; other confidences fail."""
+    two = ("~retrieval", "+retrieval@retrieval.vlad=vlad", "+retrieval@retrieval.drive=vlad")
+    values = ("retrieval.vlad.num_words=8", "retrieval.drive.num_words=8", "retrieval.drive.standardize=auto")
+    data = [each for each in small(shared(tmp_path_factory)) if not each.startswith("retrieval")]
+    job = functools.partial(settings_of, *data, "figures=0", *two, *values)
+    evaluation.evaluate(job(f"out={tmp_path}/run"))
+    [heading] = [line for line in capsys.readouterr().out.splitlines() if " queries, " in line]
+    assert "(vlad and drive, standardized by drive)" in heading
+    assert "retrieval with the queries so far alone (running): R@1" in heading
+    confidence = f"confidence={tmp_path}/run/confidence.json"
+    evaluation.evaluate(job(f"out={tmp_path}/same", confidence))
+    with pytest.raises(InputError, match=r"fitted with standardize=running, got drive; set retrieval.standardize"):
+        evaluation.evaluate(job(f"out={tmp_path}/other", confidence, "retrieval.drive.standardize=running"))
 
 
 def test_steering_takes_aliked_if_its_weights_are_installed(weights, monkeypatch, recwarn):

@@ -1,6 +1,7 @@
 """A map as a program of one's own makes, opens and calibrates it."""
 
 import json
+import warnings
 from contextlib import nullcontext
 from dataclasses import replace
 
@@ -17,6 +18,7 @@ from mfvpr.evaluation.drives import STREETS
 from mfvpr.evaluation.system import noise_images
 from mfvpr.features import VladFitting
 from mfvpr.localization import map_settings
+from mfvpr.retrieval.standardization import standardize
 from mfvpr.storage import FeatureCache
 from mfvpr.storage.maps import MapFile
 from tests.builders import map_system
@@ -69,6 +71,24 @@ def test_an_image_is_located_on_a_route(street, small_street):
         assert prediction == replace(alone, located=by_hand(alone, street.there[:-2]))
         assert prediction.located is not None
         assert "located" not in prediction.as_json()
+
+
+def test_descriptors_are_standardized_with_and_without_a_route(small_street, tmp_path):
+    """A confidence holds for images of a drive or for single ones; the candidates are the rows that the rule ranks."""
+    known = Map.create(tmp_path, small_street / "database", small("steering", retrieval={"standardize": "auto"}))
+    queries = sorted((small_street / "queries").iterdir())[:4]
+    vectors = np.stack([known.describing.image(path)[1] for path in queries])
+    rows = known._vectors[: len(known)]
+    for rule, route in (("database", None), ("running", Route())):
+        of_queries, of_rows = standardize(vectors, rows, rule)
+        for path, query in zip(queries, of_queries, strict=True):
+            listed = {each.row for each in known.localize(path, route=route).alternatives}
+            assert listed == {*np.argsort(-(of_rows @ query), kind="stable")[:5].tolist()}
+    with warnings.catch_warnings(action="ignore"):
+        known.calibrate(small_street / "database", small_street / "queries", route=True)
+    assert Map.open(tmp_path).localize(queries[0], route=Route()).confidence is not None
+    with pytest.raises(InputError, match="expected one that was fitted with standardize=database, got running"):
+        Map.open(tmp_path).localize(queries[0])
 
 
 def test_a_robot_off_the_map_has_no_place(street, small_street):

@@ -3,9 +3,10 @@
 import numpy as np
 import pytest
 
+from mfvpr.core.types import Shortlist
 from mfvpr.datasets import FrameTruth, QuerySequence, RadiusTruth
-from mfvpr.retrieval import StandardizedSearch
-from mfvpr.retrieval.standardization import PRIOR, standardize
+from mfvpr.retrieval import Alternating, RetrievalResult, StandardizedSearch
+from mfvpr.retrieval.standardization import PRIOR, GrowingDatabase, Moments, standardize
 
 RNG = np.random.default_rng(0)
 DATABASE = RNG.normal(1.0, 2.0, (30, 12)).astype(np.float32)
@@ -91,3 +92,47 @@ def test_auto_is_the_drive_where_frames_count(truth, rule):
     sequence = QuerySequence("walk", None, truth)  # pyright: ignore[reportArgumentType]
     assert StandardizedSearch("auto").of(sequence) == StandardizedSearch(rule)
     assert StandardizedSearch("running").of(sequence) == StandardizedSearch("running")
+
+
+@pytest.mark.parametrize("size", [3, 15, 16, 17, 30])
+def test_a_growing_database_is_standardized_as_one_that_has_all_rows(size):
+    """For single images, and for a drive image by image; the statistics are those of the rows that a step counts."""
+    step = 1 if size < 16 else 2
+    basis, rows = DATABASE[: size // step * step], DATABASE[:size]
+    growing, drive = GrowingDatabase(), None
+    for smaller in range(1, size):  # as the map grew
+        growing.standardize(DATABASE[:smaller], QUERIES[:1], None)
+    for number, query in enumerate(QUERIES):
+        drive = Moments.of(query[None]).joined(drive)
+        [got], of_rows = growing.standardize(rows, query[None], drive)
+        expected, of_basis = standardize(QUERIES[: number + 1], basis, "running")
+        np.testing.assert_allclose(got, expected[-1], atol=1e-6)
+        np.testing.assert_allclose(of_rows[: len(basis)], of_basis, atol=1e-6)
+        np.testing.assert_allclose(of_rows[len(basis) :], Moments.of(basis).standardize(rows[len(basis) :]), atol=1e-6)
+    [got], of_rows = growing.standardize(rows, QUERIES[:1], None)
+    expected, of_basis = standardize(QUERIES[:1], basis, "database")
+    np.testing.assert_allclose(got, expected[0], atol=1e-6)
+    np.testing.assert_allclose(of_rows[: len(basis)], of_basis, atol=1e-6)
+
+
+class Chosen:
+    """A retrieval that knows its candidates."""
+
+    def __init__(self, rows, bad_queries=()):
+        self.rows, self.bad = np.array(rows, np.int32), dict.fromkeys(bad_queries, "unreadable")
+
+    def shortlist(self, sequence, database, num_candidates, cache):
+        rows = self.rows[:, :num_candidates]
+        return RetrievalResult(Shortlist(rows, np.ones(rows.shape, np.float32), rows >= 0), self.bad, {7: "gray"})
+
+
+def test_two_retrievals_alternate():
+    first = Chosen([[0, 1, 2, 3], [4, 5, -1, -1], [-1, -1, -1, -1]], bad_queries=[1, 2])
+    second = Chosen([[1, 6, 0, 2], [5, 4, 3, -1], [-1, -1, -1, -1]], bad_queries=[2])
+    sequence = QuerySequence("walk", range(3), None)  # pyright: ignore[reportArgumentType]
+    result = Alternating(first, second).shortlist(sequence, None, 4, None)  # pyright: ignore[reportArgumentType]
+    shortlist = result.candidates
+    np.testing.assert_array_equal(shortlist.indices, [[0, 1, 6, 2], [4, 5, 3, -1], [-1, -1, -1, -1]])
+    np.testing.assert_array_equal(shortlist.mask, shortlist.indices >= 0)
+    np.testing.assert_array_equal(shortlist.scores, [[1, 0.75, 0.5, 0.25], [1, 0.75, 0.5, 0], [0, 0, 0, 0]])
+    assert (result.bad_queries, result.bad_database) == ({2: "unreadable"}, {7: "gray"})
