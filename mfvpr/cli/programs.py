@@ -149,6 +149,8 @@ def _add_functions(parser: argparse.ArgumentParser, functions: str | dict[str, s
         options |= {} if is_required else {"default": each.default}
         if get_origin(kind) is Literal:
             options["choices"] = get_args(kind)
+        elif kind is bool:
+            options = {"action": "store_true"}
         if each.kind is inspect.Parameter.KEYWORD_ONLY:
             flag = name.strip("_").replace("_", "-")
             parser.add_argument(f"--{flag}", dest=name, required=is_required, **options)
