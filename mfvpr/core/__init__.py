@@ -6,10 +6,10 @@ score is, a function of the matches of one pair, and reads its parameters; `weig
 paper's scores stand in `aggregate` (read it first), `anchor` and `histogram`, each from the equation to the result.
 `batch` scores all candidates of a query, and grids, with `vmap` and `lax.map` around the function of one pair;
 `ranking` sorts the scores, `metrics` counts the hits. A function is compiled where it says `@compiled`, once for each
-shape of the arrays, static field, class of a score, and capacity of bins (a multiple of 8): other numbers compile
-nothing. A score of one pair, `scorer(matches)`, runs operation by operation. To add a score, write a class like
-`AggregatedScore`, and call `mfvpr.testing.check_scorer` in its test; the README beside this file says how programs
-learn its name. The example uses jax, numpy as np, `dataclasses.replace` and names of this package:
+shape and type of the arrays, static field, class of a score, and capacity of bins (of candidates, a multiple of 8):
+other numbers compile nothing. A score of one pair, `scorer(matches)`, runs operation by operation. To add a score,
+write a class like `AggregatedScore`, and call `mfvpr.testing.check_scorer` in its test; the README beside this says
+how programs learn its name. The example uses jax, numpy as np, `dataclasses.replace` and names of this package:
 
     unit = lambda rows: rows / np.linalg.norm(rows, axis=-1, keepdims=True)
     rng = np.random.default_rng(0)

@@ -55,7 +55,7 @@ def score_candidates(scorer: Scorer, matches: Matches) -> Float[jax.Array, " can
     if on_host(scorer):
         return jnp.asarray(score_pairs(scorer, matches))
     scores = _score_candidates(fit_to_sizes(partial(fit_capacities, scorer, multiple=BIN_STEP), matches), matches)
-    require_scores(type(scorer).__name__, scores)
+    require_scores(type(scorer).__name__, scores, len(matches.mask))
     return scores
 
 
@@ -75,8 +75,8 @@ def score_grid(scorer: Any, matches: Matches, **axes: Sequence[Any] | Array) -> 
     is empty, not one-dimensional, or names no numeric parameter of the scorer raises a `ValueError`.
 
     The `axes` are values of the scorer's numbers; of numbers of its parts, `**{"inner.sigma": [10., 22.5]}`; of
-    `max_distance`, beyond which matches do not count; and of `weight`, by the words fs, dmf, ratio, unit or a value
-    such as `UnitWeight()`.
+    `max_distance`, beyond which matches do not count (None = any); and of `weight`, by the words fs, dmf, ratio, unit
+    or a value such as `UnitWeight()`.
     """
     if not axes:
         raise ValueError("score_grid: expected at least one axis, such as sigma=[10.0, 22.5]")
@@ -138,7 +138,7 @@ def score_settings(
         )
     else:
         scores = _score_settings(scorer, matches, dict(settings), dict(weightings))
-    require_scores("scorer", scores)
+    require_scores(type(scorer).__name__, scores.reshape(-1, *scores.shape[2:])[0], len(matches.mask))
     return scores
 
 
@@ -283,11 +283,15 @@ def _axis(scorer: Any, name: str, axis: Sequence[float] | Array) -> Array:
     if name not in numeric:
         names = ", ".join(numeric)
         raise ValueError(f"{type(scorer).__name__} has no numeric parameter {name!r}; expected one of {names}")
+    if name == "max_distance" and not hasattr(axis, "dtype"):
+        axis = [np.inf if value is None else value for value in axis]
     points = np.asarray(axis) if is_concrete(axis) else jnp.asarray(axis)  # on the host, which takes them apart
     if not (jnp.issubdtype(points.dtype, jnp.integer) and name in whole_numbers(scorer)):
         points = points.astype(jnp.result_type(float))
     if points.ndim != 1 or points.size == 0:
         raise ValueError(f"grid axis {name}: expected at least one value in one dimension, got shape {points.shape}")
+    if isinstance(points, np.ndarray) and np.isnan(points).any():
+        raise ValueError(f"grid axis {name}: expected numbers, got {points.tolist()}")
     parameters = parameters_of(scorer) if is_dataclass(scorer) else {}
     if isinstance(points, np.ndarray) and name in parameters:
         parameters[name].check_numbers(name, points)

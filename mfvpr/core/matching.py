@@ -28,7 +28,7 @@ def match(
         matches = mfvpr.match(features0, features1, with_ratio=True)
 
     Slot k of the result belongs to keypoint k of image 0 (K = N0), or of image 1 (K = N1) where cross_check is
-    `candidate`; the first index wins a tie.
+    `candidate`; the first index wins a tie. Nearest is the largest dot product: descriptors need unit length.
 
     Args:
         features0: query, keypoints `[N0, 2]`; padding may hold anything.

@@ -48,7 +48,7 @@ def recall_at_k(
         raise InputError(f"order: expected database rows [Q, C], best first, got {got}")
     if min(ks, default=1) < 1:
         raise InputError(f"ks: expected depths from 1, got {min(ks)}")
-    sets = positives if isinstance(positives, Positives) else _Matrix(np.asarray(as_array(positives), bool))
+    sets = positives if isinstance(positives, Positives) else _Matrix(np.asarray(as_array(positives)))
     return np.array([hits(order, sets, k).sum() for k in ks], int) / max(len(order), 1)
 
 
@@ -58,7 +58,9 @@ class _Matrix:
     def __init__(self, matrix: np.ndarray) -> None:
         if matrix.ndim != 2:
             raise InputError(f"positives: expected a matrix [queries, database], got shape {matrix.shape}")
-        self.matrix = matrix
+        if not np.isin(matrix, (0, 1)).all():
+            raise InputError("positives: expected True and False for each database row, got other values, such as rows")
+        self.matrix = matrix.astype(bool)
 
     def contains(self, rows: np.ndarray) -> Bool[np.ndarray, "queries k"]:
         """See `Positives`."""

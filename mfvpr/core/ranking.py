@@ -48,9 +48,10 @@ def rank(
 
 
 def _as_order_keys(keys: Array | None) -> Array | None:
-    """Replace 64-bit integers, which JAX truncates, by smaller integers in the same order."""
-    if isinstance(keys, np.ndarray) and keys.dtype in (np.int64, np.uint64):
-        return np.unique(keys, return_inverse=True)[1].reshape(keys.shape)
+    """Replace 64-bit numbers, which JAX truncates, by smaller integers in the same order; NaN stays."""
+    if isinstance(keys, np.ndarray) and keys.dtype in (np.int64, np.uint64, np.float64):
+        places = np.unique(keys, return_inverse=True)[1].reshape(keys.shape)
+        return np.where(np.isnan(keys), np.nan, places).astype(np.float32) if np.isnan(keys).any() else places
     return keys
 
 

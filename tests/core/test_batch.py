@@ -16,6 +16,7 @@ from mfvpr import (
     DescriptorDistanceWeight,
     FeatureScoreWeight,
     HistogramOfShifts,
+    InputError,
     MatchCount,
     UnitWeight,
     filter_matches,
@@ -27,6 +28,7 @@ from mfvpr.core import histogram
 from mfvpr.core.batch import by_capacity
 from tests.builders import random_matches, stack
 from tests.scorers import Strongest, Wrapped
+from tests.shapes import unchecked_shapes
 
 pytestmark = pytest.mark.thorough
 
@@ -99,6 +101,18 @@ def test_kinds_of_weights_and_distances_are_axes_too(matches):
             np.testing.assert_allclose(got[i, j], expected, rtol=2e-6)
     words = score_grid(AggregatedScore(), matches, max_distance=[0.7, 1.5], weight=["fs", "dmf", "unit"])
     np.testing.assert_array_equal(words, got)
+    any_distance = score_grid(AggregatedScore(), matches, max_distance=[0.7, None], weight=["fs"])
+    np.testing.assert_allclose(any_distance[1, 0], score_candidates(AggregatedScore(weight=weights[0]), matches), 2e-6)
+
+
+@pytest.mark.parametrize("forgets", [lambda matches: matches.distance, lambda matches: matches.distance[:1]])
+def test_a_score_that_is_no_number_is_refused(matches, forgets):
+    for call in (score_candidates, partial(score_grid, max_distance=[0.7, 1.5])):
+        with (
+            unchecked_shapes(),
+            pytest.raises(InputError, match=r"expected a number for each of \d+ pairs, got an array"),
+        ):
+            call(forgets, matches)
 
 
 def test_fine_bins_do_not_tax_coarse_ones(matches):
@@ -119,6 +133,7 @@ def test_fine_bins_do_not_tax_coarse_ones(matches):
         (HistogramOfShifts(), {"sigma": [-3.0, 10.0]}, "expected a"),
         (HistogramOfShifts(), {"max_bins": [1]}, "no numeric parameter"),
         (HistogramOfShifts(), {"sigma": []}, "at least one value"),
+        (HistogramOfShifts(), {"max_distance": [np.nan, 1.0]}, "max_distance: expected numbers"),
         (AnchorPoints(), {"weight": ["unti"]}, "weight='unti': expected one of fs, dmf, ratio, unit"),
         (MatchCount(), {"weight": [UnitWeight()]}, "no numeric parameter 'weight'; expected one of max_distance"),
     ],

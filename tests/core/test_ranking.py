@@ -45,6 +45,12 @@ def test_combined_score_spans_plain_to_retrieval_order():
     np.testing.assert_allclose(combine(retrieval_scores, scores, c=3.0), expected, 1e-6)
 
 
+def test_double_precision_is_ranked_as_it_is():
+    scores = np.array([1.0, 1 + 1e-9, np.nan, 1.0, 3e300])
+    np.testing.assert_array_equal(rank(scores), [4, 1, 0, 3, 2])
+    np.testing.assert_array_equal(rank(scores[:2]), [1, 0])
+
+
 @pytest.mark.parametrize("dtype", [np.uint8, np.int8, np.uint32, np.int32, np.uint64, np.int64, np.bool_])
 def test_whole_numbers_are_ranked_as_they_are(dtype):
     np.testing.assert_array_equal(rank(jnp.array([2**24, 2**24 + 1, 7])), [1, 0, 2])  # not as float32

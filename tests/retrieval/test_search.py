@@ -128,6 +128,9 @@ def test_recall(seed, depth):
     expected = oracles.recall_at_k(order, positives, ks)
     np.testing.assert_allclose(recall_at_k(order, positives, ks), expected)
     np.testing.assert_array_equal(recall_at_k(order, Positives(positives), ks), expected)
+    for wrong in (np.argsort(positives, axis=1)[:, :3] + 1, np.where(positives, 0.5, np.nan)):
+        with unchecked_shapes(), pytest.raises(InputError, match=r"^positives: expected True and False"):
+            recall_at_k(order, wrong, ks)
 
 
 def test_descriptors_of_different_lengths_and_masks_of_another_shape_are_refused():
