@@ -56,7 +56,7 @@ def write_run(folder, *, sequences=("</style><b onclick=alert(3)>",), ranks=RANK
     known = FrameTruth(tuple((row,) for row in ROWS), len(ROWS)) if truth else None
     drives = tuple(QuerySequence(name, ImageFolder("queries", HOSTILE), known) for name in sequences)
     scores = {name: SimpleNamespace(name=name, base=None, step=None, scorers=()) for name in ranks}
-    pipeline = SimpleNamespace(candidates=CANDIDATES)
+    pipeline = SimpleNamespace(candidates=CANDIDATES, retriever=None)
     ranked = RankedDataset(
         Dataset(sequences[0], ImageFolder("database", HOSTILE[::-1]), drives),
         SimpleNamespace(headline=HEADLINE, final_scores=scores, scorers={}, pipeline=pipeline),
