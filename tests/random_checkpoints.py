@@ -325,3 +325,27 @@ def aliked_shapes(widths: tuple[int, ...] = (8, 16, 32, 64), dimension: int = 64
         plain[f"score_head.{place}"] = size
     shapes = {f"{name}.weight": shape for name, shape in plain.items()} | with_biases(biased) | _norms(norms)
     return shapes | {f"{head}.agg_weights": (positions, dimension, dimension)}
+
+
+def xfeat_shapes() -> Shapes:
+    """The tensors of xfeat.pt, but for most of the refinement of matches."""
+    stacks = {  # outputs, inputs, size of each convolution with normalization; outputs of a last one
+        "block1": ([(4, 1, 3), (8, 4, 3), (8, 8, 3), (24, 8, 3)], 0),
+        "block2": ([(24, 24, 3)] * 2, 0),
+        "block3": ([(64, 24, 3), (64, 64, 3), (64, 64, 1)], 0),
+        "block4": ([(64, 64, 3)] * 3, 0),
+        "block5": ([(128, 64, 3), (128, 128, 3), (128, 128, 3), (64, 128, 1)], 0),
+        "block_fusion": ([(64, 64, 3)] * 2, 64),
+        "heatmap_head": ([(64, 64, 1)] * 2, 1),
+        "keypoint_head": ([(64, 64, 1)] * 3, 65),
+    }
+    last = {"skip1.1": (24, 1, 1, 1), "fine_matcher.0": (512, 128)}
+    shapes: Shapes = {}
+    for stack, (convolutions, outputs) in stacks.items():
+        for place, (width, inputs, size) in enumerate(convolutions):
+            layer = f"{stack}.{place}.layer"
+            shapes |= {f"{layer}.0.weight": (width, inputs, size, size), f"{layer}.1.num_batches_tracked": ()}
+            shapes |= {f"{layer}.1.running_{name}": (width,) for name in ("mean", "var")}
+        if outputs:
+            last[f"{stack}.{len(convolutions)}"] = (outputs, 64, 1, 1)
+    return shapes | with_biases(last)
