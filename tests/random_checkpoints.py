@@ -329,23 +329,16 @@ def aliked_shapes(widths: tuple[int, ...] = (8, 16, 32, 64), dimension: int = 64
 
 def xfeat_shapes() -> Shapes:
     """The tensors of xfeat.pt, but for most of the refinement of matches."""
-    stacks = {  # outputs, inputs, size of each convolution with normalization; outputs of a last one
-        "block1": ([(4, 1, 3), (8, 4, 3), (8, 8, 3), (24, 8, 3)], 0),
-        "block2": ([(24, 24, 3)] * 2, 0),
-        "block3": ([(64, 24, 3), (64, 64, 3), (64, 64, 1)], 0),
-        "block4": ([(64, 64, 3)] * 3, 0),
-        "block5": ([(128, 64, 3), (128, 128, 3), (128, 128, 3), (64, 128, 1)], 0),
-        "block_fusion": ([(64, 64, 3)] * 2, 64),
-        "heatmap_head": ([(64, 64, 1)] * 2, 1),
-        "keypoint_head": ([(64, 64, 1)] * 3, 65),
-    }
-    last = {"skip1.1": (24, 1, 1, 1), "fine_matcher.0": (512, 128)}
+    widths = {"block1": (1, 4, 8, 8, 24), "block2": (24,) * 3, "block3": (24, 64, 64, 64), "block4": (64,) * 4}
+    widths |= {"block5": (64, 128, 128, 128, 64), "block_fusion": (64,) * 3}
+    widths |= {"heatmap_head": (64,) * 3, "keypoint_head": (64,) * 4}
     shapes: Shapes = {}
-    for stack, (convolutions, outputs) in stacks.items():
-        for place, (width, inputs, size) in enumerate(convolutions):
-            layer = f"{stack}.{place}.layer"
-            shapes |= {f"{layer}.0.weight": (width, inputs, size, size), f"{layer}.1.num_batches_tracked": ()}
-            shapes |= {f"{layer}.1.running_{name}": (width,) for name in ("mean", "var")}
-        if outputs:
-            last[f"{stack}.{len(convolutions)}"] = (outputs, 64, 1, 1)
-    return shapes | with_biases(last)
+    for stack, layers in widths.items():
+        for place, (inputs, outputs) in enumerate(pairwise(layers)):
+            layer = f"{stack}.{place}"
+            size = 1 if "head" in stack or layer in ("block3.2", "block5.3") else 3
+            shapes[f"{layer}.layer.0.weight"] = (outputs, inputs, size, size)
+            shapes |= {f"{layer}.layer.1.running_{name}": (outputs,) for name in ("mean", "var")}
+    last = {"block_fusion.2": 64, "heatmap_head.2": 1, "keypoint_head.3": 65}
+    biased = {"skip1.1": (24, 1, 1, 1), "fine_matcher.0": (512, 128)}
+    return shapes | with_biases(biased | {layer: (outputs, 64, 1, 1) for layer, outputs in last.items()})

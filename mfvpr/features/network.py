@@ -1,8 +1,7 @@
 """Extractors with a network: their base, which runs images in batches, global descriptors, and keypoints.
 
 Keypoints are those of ALIKED (Zhao et al., IEEE TIM 2023), XFeat (Potje et al., CVPR 2024) and D2-Net (Dusmanu et al.,
-CVPR 2019). A program has as many keypoint slots as images usually need; images with more keypoints run again in a larger
-program.
+CVPR 2019). A program has as many keypoint slots as images usually need; images with more run again in a larger program.
 """
 
 import math
@@ -28,7 +27,7 @@ from mfvpr.utils.numerics import device_bytes, knows_own_context, repeat_last
 from mfvpr.utils.runtime import ordered_map
 
 TOGETHER = 8  # images on an accelerator: with more, cuDNN may choose a method that takes thirty times as long
-_PIXELS_PER_SLOT = 40  # of ALIKED and XFeat; photographs have a keypoint in 65 px at most
+_PIXELS_PER_SLOT = 40  # photographs have a keypoint of XFeat in 44 px at most, one of ALIKED in 65 px
 _SHARE = 0.3  # keypoint slots of D2-Net per position of its map; photographs take about a tenth
 _SMALLEST_MAP = 2  # of D2-Net
 
@@ -277,8 +276,8 @@ class XFeatFeatures(KeypointNetwork):
 
     @property
     def scales(self) -> tuple[Scale, ...]:
-        """One scale. Images have one keypoint in 125 px, or `max_keypoints`."""
-        return (Scale(self.model.dimension, min(self._limit, math.prod(self.image_size) // 125)),)
+        """One scale. Images have one keypoint in 60 px, or `max_keypoints`."""
+        return (Scale(self.model.dimension, min(self._limit, math.prod(self.image_size) // 60)),)
 
     def compute(self, model: xfeat.XFeat, images: jax.Array, *, slots: int) -> Any:
         return (model.extract(images.astype(jnp.float32) / 255, self.threshold, slots),)

@@ -33,6 +33,7 @@ class Layer(nnx.Module):
     """Convolution, batch normalization without scale and shift, ReLU."""
 
     def __init__(self, inputs: int, outputs: int, size: int = 3, stride: int = 1, *, rngs: nnx.Rngs) -> None:
+        self.stride = stride
         self.conv = (
             layers.conv(inputs, outputs, stride=stride, rngs=rngs)
             if size == 3
@@ -47,12 +48,11 @@ class Layer(nnx.Module):
         """Convolve a map. On a CPU, XLA's own convolution takes 2 to 20 times as long for up to 4 channels."""
         if isinstance(self.conv, nnx.Linear):
             return self.conv(x)
-        inputs, stride, fast = x.shape[-1], self.conv.strides, None
-        if inputs <= 4:
-            fast = partial(_sum_of_shifts, stride=stride)
-        elif inputs >= _WIDE and stride == 1:
+        if x.shape[-1] <= 4:
+            fast = partial(_sum_of_shifts, stride=self.stride)
+        elif x.shape[-1] >= _WIDE and self.stride == 1:
             fast = partial(layers.winograd, dilation=1)
-        if fast is None:
+        else:
             return self.conv(x)
         return lax.platform_dependent(x, self.conv.kernel[...], cpu=fast, default=lambda x, _: self.conv(x))
 

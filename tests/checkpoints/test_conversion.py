@@ -29,7 +29,6 @@ PUBLIC = {
         for kind, positions in (("16", 16), ("16rot", 16), ("32", 32))
     },
     "aliked_lightglue": checkpoints.lightglue_shapes(),
-    "xfeat": checkpoints.xfeat_shapes(),
     **{f"patchnetvlad_mapillary_{outputs}": checkpoints.netvlad_shapes(16, outputs) for outputs in (4096, 512, 128)},
     **{f"patchnetvlad_pitts_{outputs}": checkpoints.netvlad_shapes(64, outputs) for outputs in (4096, 512, 128)},
     "patchnetvlad_landmarks_4096": checkpoints.netvlad_shapes(64, 4096),

@@ -1,6 +1,4 @@
-"""XFeat from its paper and published settings: float64, loops over pixels and taps, published keys, no JAX."""
-
-import math
+"""XFeat from its paper and published settings: float64, published keys, no JAX."""
 
 import numpy as np
 
@@ -23,105 +21,72 @@ def keys(distance: float) -> float:
 def sampled(dense: np.ndarray, pixel: tuple[int, int], shape: tuple[int, int], mode: str) -> np.ndarray:
     """A map `[H, W, C]` at the pixel (x, y) of an image of `shape` (height, width); zeros outside."""
     x, y = position(pixel[0], shape[1], dense.shape[1]), position(pixel[1], shape[0], dense.shape[0])
-    kernel = {"nearest": None, "bilinear": lambda distance: max(1 - abs(distance), 0), "bicubic": keys}[mode]
-    total = np.zeros(dense.shape[2])
-    for row, column in np.ndindex(dense.shape[:2]):
-        if kernel is None:  # halves to the even number
-            weight = float(row == round(y) and column == round(x))
-        else:
-            weight = kernel(y - row) * kernel(x - column)
-        if weight:
-            total += weight * dense[row, column]
-    return total
-
-
-def maxima(heatmap: np.ndarray, threshold: float) -> list[tuple[int, int]]:
-    """(x, y) of the pixels above the threshold that no pixel of their 5 x 5 neighborhood exceeds."""
-    places = []
-    for row, column in np.ndindex(heatmap.shape):
-        near = heatmap[max(row - 2, 0) : row + 3, max(column - 2, 0) : column + 3]
-        if heatmap[row, column] > threshold and heatmap[row, column] == near.max():
-            places.append((column, row))
-    return places
+    if mode == "nearest":  # halves to the even number
+        x, y = round(x), round(y)
+    kernel = keys if mode == "bicubic" else lambda distance: max(1 - abs(distance), 0)
+    rows, columns = (
+        [kernel(at - cell) for cell in range(cells)] for at, cells in zip((y, x), dense.shape, strict=False)
+    )
+    return np.einsum("r,c,rcd->d", rows, columns, dense)
 
 
 def keypoints(heatmap: np.ndarray, reliability: np.ndarray, threshold: float) -> list[tuple[float, tuple[int, int]]]:
     """(score, (x, y)) by falling score; (0, 0) stands for padding in the public code."""
     scored = []
-    for place in maxima(heatmap, threshold):
-        probability = sampled(heatmap[..., None], place, heatmap.shape, "nearest")[0]
-        score = probability * sampled(reliability[..., None], place, heatmap.shape, "bilinear")[0]
-        if score > 0 and place != (0, 0):
-            scored.append((score, place))
+    for y, x in np.ndindex(heatmap.shape):
+        if heatmap[y, x] > threshold and heatmap[y, x] == heatmap[max(y - 2, 0) : y + 3, max(x - 2, 0) : x + 3].max():
+            score = sampled(heatmap[..., None], (x, y), heatmap.shape, "nearest")[0]
+            score *= sampled(reliability[..., None], (x, y), heatmap.shape, "bilinear")[0]
+            scored += [(score, (x, y))] if score > 0 and (x, y) != (0, 0) else []
     return sorted(scored, key=lambda each: -each[0])
-
-
-def convolved(x: np.ndarray, weight: np.ndarray, stride: int = 1) -> np.ndarray:
-    """A map `[H, W, C]` and a kernel `[D, C, size, size]`, tap by tap; zeros outside."""
-    size = weight.shape[-1]
-    padded = np.pad(x, ((size // 2, size // 2), (size // 2, size // 2), (0, 0)))
-    height, width = x.shape[0] // stride, x.shape[1] // stride
-    total = np.zeros((height, width, len(weight)))
-    for down, right in np.ndindex(size, size):
-        taps = padded[down : down + stride * height : stride, right : right + stride * width : stride]
-        total += taps[:height, :width] @ weight[:, :, down, right].T
-    return total
-
-
-def enlarged(x: np.ndarray, factor: int) -> np.ndarray:
-    """Bilinear, by the centers of pixels; the border is repeated."""
-    for axis in (0, 1):
-        size = x.shape[axis]
-        rows = []
-        for place in range(size * factor):
-            at = min(max((place + 0.5) / factor - 0.5, 0), size - 1)
-            low = math.floor(at)
-            rows.append((low + 1 - at) * x.take(low, axis) + (at - low) * x.take(min(low + 1, size - 1), axis))
-        x = np.stack(rows, axis)
-    return x
-
-
-class Network:
-    def __init__(self, tensors: dict[str, np.ndarray]) -> None:
-        self.tensors = {key: np.asarray(value, np.float64) for key, value in tensors.items()}
-
-    def last(self, name: str, x: np.ndarray) -> np.ndarray:
-        return convolved(x, self.tensors[f"{name}.weight"]) + self.tensors[f"{name}.bias"]
-
-    def stack(self, name: str, x: np.ndarray) -> np.ndarray:
-        """All convolutions with normalization of a part."""
-        for place in range(4):
-            layer = f"{name}.{place}"
-            if f"{layer}.layer.0.weight" in self.tensors:
-                x = convolved(x, self.tensors[f"{layer}.layer.0.weight"], 2 if layer in STRIDES else 1)
-                mean, variance = (self.tensors[f"{layer}.layer.1.running_{each}"] for each in ("mean", "var"))
-                x = np.maximum((x - mean) / np.sqrt(variance + 1e-5), 0)
-        return x
-
-    def maps(self, image: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Descriptors of unit length, reliability and heatmap of an image `[H, W, 3]`, 0 .. 1."""
-        gray = image.astype(np.float64).mean(axis=2)
-        gray = (gray - gray.mean()) / np.sqrt(gray.var() + 1e-5)
-        height, width = gray.shape
-        pooled, cells = np.zeros((height // 4, width // 4, 1)), np.zeros((height // 8, width // 8, 64))
-        for row, column in np.ndindex(pooled.shape[:2]):
-            pooled[row, column] = gray[4 * row : 4 * row + 4, 4 * column : 4 * column + 4].mean()
-        for row, column in np.ndindex(cells.shape[:2]):
-            cells[row, column] = gray[8 * row : 8 * row + 8, 8 * column : 8 * column + 8].reshape(-1)
-        fine = self.stack("block2", self.stack("block1", gray[..., None]) + self.last("skip1.1", pooled))
-        coarse = self.stack("block3", fine)
-        coarser = self.stack("block4", coarse)
-        pyramid = coarse + enlarged(coarser, 2) + enlarged(self.stack("block5", coarser), 4)
-        features = self.last("block_fusion.2", self.stack("block_fusion", pyramid))
-        reliability = 1 / (1 + np.exp(-self.last("heatmap_head.2", self.stack("heatmap_head", features))[..., 0]))
-        logits = np.exp(self.last("keypoint_head.3", self.stack("keypoint_head", cells)))
-        heatmap = np.zeros((height, width))
-        for row, column in np.ndindex(cells.shape[:2]):
-            part = logits[row, column] / logits[row, column].sum()
-            heatmap[8 * row : 8 * row + 8, 8 * column : 8 * column + 8] = part[:64].reshape(8, 8)
-        return features / np.linalg.norm(features, axis=2, keepdims=True), reliability, heatmap
 
 
 def descriptor(features: np.ndarray, pixel: tuple[int, int], shape: tuple[int, int]) -> np.ndarray:
     vector = sampled(features, pixel, shape, "bicubic")
     return vector / np.linalg.norm(vector)
+
+
+def convolved(x: np.ndarray, weight: np.ndarray, stride: int = 1) -> np.ndarray:
+    """A map `[H, W, C]` and a kernel `[D, C, size, size]`, tap by tap; zeros outside."""
+    margin, (height, width) = weight.shape[-1] // 2, x.shape[:2]
+    x, taps = np.pad(x, ((margin, margin), (margin, margin), (0, 0))), np.ndindex(weight.shape[2:])
+    return sum(x[i : i + height : stride, j : j + width : stride] @ weight[:, :, i, j].T for i, j in taps)
+
+
+def enlarged(x: np.ndarray, factor: int) -> np.ndarray:
+    """Bilinear, by the centers of pixels; the border is repeated."""
+    for axis in (0, 1):
+        centers = (np.arange(factor * x.shape[axis]) + 0.5) / factor - 0.5
+        line = lambda values, at=centers: np.interp(at, np.arange(len(values)), values)  # noqa: E731
+        x = np.apply_along_axis(line, axis, x)
+    return x
+
+
+def maps(image: np.ndarray, tensors: dict[str, np.ndarray]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Descriptors of unit length, reliability and heatmap of an image `[H, W, 3]`, 0 .. 1, with published tensors."""
+
+    def last(name: str, x: np.ndarray) -> np.ndarray:
+        return convolved(x, tensors[f"{name}.weight"]) + tensors[f"{name}.bias"]
+
+    def stack(name: str, x: np.ndarray) -> np.ndarray:
+        for layer in (f"{name}.{place}" for place in range(4)):
+            if f"{layer}.layer.0.weight" in tensors:  # has a normalization
+                x = convolved(x, tensors[f"{layer}.layer.0.weight"], 2 if layer in STRIDES else 1)
+                mean, variance = (tensors[f"{layer}.layer.1.running_{each}"] for each in ("mean", "var"))
+                x = np.maximum((x - mean) / np.sqrt(variance + 1e-5), 0)
+        return x
+
+    gray = image.mean(axis=2)
+    gray = (gray - gray.mean()) / np.sqrt(gray.var() + 1e-5)
+    pooled = sum(gray[i::4, j::4, None] for i, j in np.ndindex(4, 4)) / 16
+    coarse = stack("block3", stack("block2", stack("block1", gray[..., None]) + last("skip1.1", pooled)))
+    coarser = stack("block4", coarse)
+    pyramid = coarse + enlarged(coarser, 2) + enlarged(stack("block5", coarser), 4)
+    features = last("block_fusion.2", stack("block_fusion", pyramid))
+    reliability = 1 / (1 + np.exp(-last("heatmap_head.2", stack("heatmap_head", features))[..., 0]))
+    cells = np.stack([gray[i::8, j::8] for i, j in np.ndindex(8, 8)], axis=2)
+    logits = np.exp(last("keypoint_head.3", stack("keypoint_head", cells)))
+    heatmap = np.zeros(gray.shape)
+    for place, (i, j) in enumerate(np.ndindex(8, 8)):
+        heatmap[i::8, j::8] = logits[..., place] / logits.sum(axis=2)
+    return features / np.linalg.norm(features, axis=2, keepdims=True), reliability, heatmap
