@@ -26,25 +26,21 @@ IMAGES = np.stack([texture(*SIZE, seed=seed) for seed in (0, 1)])
 
 
 @pytest.fixture(scope="module")
-def network() -> xfeat.XFeat:
-    return fill_published("xfeat", TENSORS)
-
-
-@pytest.fixture(scope="module")
-def results(network):
-    """Maps and detections of the batch."""
+def results():
+    """The network, and its maps and detections of the batch."""
 
     def run(model, images):
         images = images.astype(jnp.float32) / 255
         return model.maps(images), model.extract(images, THRESHOLD, 400)
 
-    return jax.tree.map(np.asarray, compile_network(network, run)(IMAGES))
+    network = fill_published("xfeat", TENSORS)
+    return network, *jax.tree.map(np.asarray, compile_network(network, run)(IMAGES))
 
 
 @pytest.mark.parametrize("place", [0, 1])
 def test_maps_and_keypoints_agree_with_the_oracle(results, place):
     expected = oracle.maps(IMAGES[place] / 255, TENSORS)
-    (ours, detections), shape = jax.tree.map(lambda values: values[place], results), SIZE[::-1]
+    (ours, detections), shape = jax.tree.map(lambda values: values[place], results[1:]), SIZE[::-1]
     for our_map, their_map in zip(ours, expected, strict=True):
         np.testing.assert_allclose(our_map, their_map, atol=2e-5)
     keypoints = oracle.keypoints(expected[2], expected[1], THRESHOLD)
@@ -52,33 +48,34 @@ def test_maps_and_keypoints_agree_with_the_oracle(results, place):
     assert 40 < count == detections.count == detections.mask.sum() < 400
     np.testing.assert_array_equal(detections.keypoints[:count], [pixel for _, pixel in keypoints])
     np.testing.assert_allclose(detections.scores[:count], [score for score, _ in keypoints], atol=1e-5)
-    descriptors = [oracle.descriptor(expected[0], pixel, shape) for _, pixel in keypoints]
+    descriptors = [oracle.sampled(expected[0], pixel, shape, "bicubic") for _, pixel in keypoints]
     np.testing.assert_allclose(detections.descriptors[:count], descriptors, atol=5e-5)
 
 
 @pytest.mark.optimized
-def test_single_images_give_the_bits_of_a_batch(network, results):
-    extractor = XFeatFeatures(network, SIZE, threshold=THRESHOLD, max_keypoints=400)  # one by one on a CPU
-    for place, features in enumerate(local(extractor(IMAGES))):
+def test_on_a_cpu_a_batch_gives_the_bits_of_single_images(results):
+    network, _, detections = results
+    extractor = XFeatFeatures(network, SIZE, threshold=THRESHOLD, max_keypoints=400)
+    for place, features in enumerate(local(extractor(np.concatenate([IMAGES, IMAGES])))):
+        (single,) = local(extractor(IMAGES[place % 2, None]))
         for name in ("keypoints", "scores", "descriptors"):
-            np.testing.assert_array_equal(
-                getattr(features, name), getattr(results[1], name)[place, : len(features.mask)]
-            )
+            values = getattr(features, name)
+            np.testing.assert_array_equal(values, getattr(single, name))
+            np.testing.assert_allclose(values, getattr(detections, name)[place % 2, : len(values)], atol=1e-6)
 
 
 @pytest.mark.parametrize("size", [32, 64, 320, 512, 1024])
 def test_rounded_positions_are_the_pixels_but_for_the_last(size):
     nearest = np.rint(xfeat.positions(size, size)).astype(int)
-    assert (
-        [*nearest] == [round(oracle.position(pixel, size, size)) for pixel in range(size)] == [*range(size - 1), size]
-    )
+    rounded = [round(oracle.position(pixel, size, size)) for pixel in range(size)]
+    assert [*nearest] == rounded == [*range(size - 1), size]  # outside the map
 
 
 def test_all_pixels_are_sampled_as_in_the_oracle():
     shape, dense = (40, 24), np.random.default_rng(0).normal(size=(5, 3, 4)).astype(np.float32)
     pixels = [(x, y) for y, x in np.ndindex(shape)]
     sampled = jax.jit(xfeat.sample_descriptors, static_argnums=2)(dense, np.array(pixels), shape)
-    np.testing.assert_allclose(sampled, [oracle.descriptor(dense, pixel, shape) for pixel in pixels], atol=2e-5)
+    np.testing.assert_allclose(sampled, [oracle.sampled(dense, pixel, shape, "bicubic") for pixel in pixels], atol=2e-5)
     ours = xfeat.sample_all(xfeat.sample_all(jnp.asarray(dense[..., 0]), shape[0]).T, shape[1]).T.reshape(-1)
     expected = [oracle.sampled(dense[..., :1], pixel, shape, "bilinear")[0] for pixel in pixels]
     np.testing.assert_allclose(ours, expected, atol=1e-5)
@@ -99,11 +96,11 @@ def test_detection_agrees_with_the_oracle(threshold, capacity):
     np.testing.assert_allclose(detections.scores[: len(scores)], scores, atol=1e-6)
 
 
-def test_sides_are_multiples_of_32(network):
+def test_sides_are_multiples_of_32(results):
     with pytest.raises(
-        InputError, match=r"^image_size=\[100, 64\]: expected multiples of 32 px .* example \[96, 64\]$"
+        InputError, match=r"^image_size=\[100, 64\]: expected multiples of 32 px .*, for .* \[96, 64\]$"
     ):
-        XFeatFeatures(network, (100, 64))
+        XFeatFeatures(results[0], (100, 64))
 
 
 @pytest.mark.optimized

@@ -19,15 +19,17 @@ def keys(distance: float) -> float:
 
 
 def sampled(dense: np.ndarray, pixel: tuple[int, int], shape: tuple[int, int], mode: str) -> np.ndarray:
-    """A map `[H, W, C]` at the pixel (x, y) of an image of `shape` (height, width); zeros outside."""
+    """A map `[H, W, C]` at the pixel (x, y) of an image of `shape` (height, width); zeros outside.
+
+    A bicubic sample is scaled to unit length.
+    """
     x, y = position(pixel[0], shape[1], dense.shape[1]), position(pixel[1], shape[0], dense.shape[0])
     if mode == "nearest":  # halves to the even number
         x, y = round(x), round(y)
     kernel = keys if mode == "bicubic" else lambda distance: max(1 - abs(distance), 0)
-    rows, columns = (
-        [kernel(at - cell) for cell in range(cells)] for at, cells in zip((y, x), dense.shape, strict=False)
-    )
-    return np.einsum("r,c,rcd->d", rows, columns, dense)
+    rows, columns = ([kernel(at - cell) for cell in range(side)] for at, side in ((y, len(dense)), (x, dense.shape[1])))
+    values = np.einsum("r,c,rcd->d", rows, columns, dense)
+    return values / np.linalg.norm(values) if mode == "bicubic" else values
 
 
 def keypoints(heatmap: np.ndarray, reliability: np.ndarray, threshold: float) -> list[tuple[float, tuple[int, int]]]:
@@ -39,11 +41,6 @@ def keypoints(heatmap: np.ndarray, reliability: np.ndarray, threshold: float) ->
             score *= sampled(reliability[..., None], (x, y), heatmap.shape, "bilinear")[0]
             scored += [(score, (x, y))] if score > 0 and (x, y) != (0, 0) else []
     return sorted(scored, key=lambda each: -each[0])
-
-
-def descriptor(features: np.ndarray, pixel: tuple[int, int], shape: tuple[int, int]) -> np.ndarray:
-    vector = sampled(features, pixel, shape, "bicubic")
-    return vector / np.linalg.norm(vector)
 
 
 def convolved(x: np.ndarray, weight: np.ndarray, stride: int = 1) -> np.ndarray:
