@@ -339,6 +339,5 @@ def xfeat_shapes() -> Shapes:
             size = 1 if "head" in stack or layer in ("block3.2", "block5.3") else 3
             shapes[f"{layer}.layer.0.weight"] = (outputs, inputs, size, size)
             shapes |= {f"{layer}.layer.1.running_{name}": (outputs,) for name in ("mean", "var")}
-    last = {"block_fusion.2": 64, "heatmap_head.2": 1, "keypoint_head.3": 65}
-    biased = {"skip1.1": (24, 1, 1, 1), "fine_matcher.0": (512, 128)}
-    return shapes | with_biases(biased | {layer: (outputs, 64, 1, 1) for layer, outputs in last.items()})
+    last: Shapes = {"skip1.1": (24, 1, 1, 1), "keypoint_head.3": (65, 64, 1, 1), "fine_matcher.0": (512, 128)}
+    return shapes | with_biases(last | {"block_fusion.2": (64, 64, 1, 1), "heatmap_head.2": (1, 64, 1, 1)})

@@ -19,10 +19,7 @@ def keys(distance: float) -> float:
 
 
 def sampled(dense: np.ndarray, pixel: tuple[int, int], shape: tuple[int, int], mode: str) -> np.ndarray:
-    """A map `[H, W, C]` at the pixel (x, y) of an image of `shape` (height, width); zeros outside.
-
-    A bicubic sample is scaled to unit length.
-    """
+    """A map `[H, W, C]` at (x, y) px of an image of `shape` (height, width); zeros outside; unit length if bicubic."""
     x, y = position(pixel[0], shape[1], dense.shape[1]), position(pixel[1], shape[0], dense.shape[0])
     if mode == "nearest":  # halves to the even number
         x, y = round(x), round(y)
