@@ -83,6 +83,24 @@ def system_of(extractor=SIFT, retriever=None, **options):
     return System(pipeline, SCORERS, {"histogram": Fusion()})
 
 
+def test_who_has_no_key_of_the_cluster_reaches_neither_scheduler_nor_workers(cluster):
+    client, context = cluster._client, ssl.create_default_context()
+    context.check_hostname, context.verify_mode = False, ssl.CERT_NONE
+    client.wait_for_workers(3)
+    workers = client.scheduler_info(n_workers=-1)["workers"]
+    addresses = {client.scheduler.address, *workers, *(worker["nanny"] for worker in workers.values())}
+    assert len(addresses) >= 7
+    for address in addresses:
+        host, port = address.removeprefix("tls://").split(":")
+        assert host == "127.0.0.1"
+        encrypted = context.wrap_socket(socket.create_connection((host, int(port))))
+        with encrypted, pytest.raises(ssl.SSLError, match="CERTIFICATE_REQUIRED"):
+            encrypted.recv(1)
+    port = int(str(cluster).rpartition(":")[2].partition("/")[0])
+    with socket.socket() as other:
+        other.bind(("127.0.0.2", port))  # free, unless the dashboard listens on all addresses
+
+
 def test_workers_describe_and_match_and_results_are_those_of_one_process(dataset, cluster, tmp_path):
     extractor = TwoScales()
     system, runtime = system_of(extractor, Retrieval(extractor)), Runtime(cluster=cluster)
@@ -113,21 +131,3 @@ def test_a_block_that_kills_every_worker_ends_the_call_and_not_the_cluster(datas
 def test_a_cluster_needs_a_folder(dataset, cluster):
     with pytest.raises(InputError, match="cluster: expected a cache with a root"):
         rank_dataset(dataset, system_of(), runtime=Runtime(cluster=cluster))
-
-
-def test_who_has_no_key_of_the_cluster_reaches_neither_scheduler_nor_workers(cluster):
-    client, context = cluster._client, ssl.create_default_context()
-    context.check_hostname, context.verify_mode = False, ssl.CERT_NONE
-    client.wait_for_workers(3)  # again, if an earlier test killed some
-    workers = client.scheduler_info(n_workers=-1)["workers"]
-    addresses = {client.scheduler.address, *workers, *(worker["nanny"] for worker in workers.values())}
-    assert len(addresses) >= 7
-    for address in addresses:
-        host, port = address.removeprefix("tls://").split(":")
-        assert host == "127.0.0.1"
-        encrypted = context.wrap_socket(socket.create_connection((host, int(port))))
-        with encrypted, pytest.raises(ssl.SSLError, match="CERTIFICATE_REQUIRED"):
-            encrypted.recv(1)
-    port = int(str(cluster).rpartition(":")[2].partition("/")[0])
-    with socket.socket() as other:
-        other.bind(("127.0.0.2", port))  # free, unless the dashboard listens on all addresses
