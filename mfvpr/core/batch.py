@@ -103,7 +103,10 @@ def score_grid(scorer: Any, matches: Matches, **axes: Sequence[Any] | Array) -> 
             score_settings(fitted, matches, {name: axis[part] for name, axis in settings.items()}, weightings)
             for fitted, part in groups
         )
-        return [jax.block_until_ready(group_scores) if on_cpu else group_scores for group_scores in scores]
+        waited = [jax.block_until_ready(group_scores) if on_cpu else group_scores for group_scores in scores]
+        for group_scores in waited:
+            require_scores("scorer", group_scores.reshape(-1, *group_scores.shape[2:])[0], len(matches.mask))
+        return waited
 
     # A plain function may close over traced values, which only the thread that traces them can use.
     use_threads = is_concrete((scorer, matches, values)) and not plain
@@ -138,7 +141,7 @@ def score_settings(
         )
     else:
         scores = _score_settings(scorer, matches, dict(settings), dict(weightings))
-    require_scores(type(scorer).__name__, scores.reshape(-1, *scores.shape[2:])[0], len(matches.mask))
+    require_scores("scorer", scores)
     return scores
 
 
