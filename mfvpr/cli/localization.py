@@ -78,6 +78,7 @@ def localize(settings: Localize) -> None:
         used = without(of_map, "fusion") if of_map["final"] == "score" else of_map
         confidence = fitting_confidences(settings.confidence, system, used)[0][system.headline]
     robot_map = Map(folder, system, confidence=confidence, threshold=settings.threshold, runtime=runtime)
+    robot_map.require_confidence(settings.route is not None)
     drive = _Drive(robot_map, settings)
     for number, (name, image) in enumerate(images_of(settings)):
         if number == 0 and len(robot_map):

@@ -11,7 +11,7 @@ from omegaconf import OmegaConf
 
 from mfvpr.evaluation.drives import Method
 from mfvpr.evaluation.protocol import Split
-from mfvpr.systems.assembly import GROUPS, KEYS, SystemSettings, by_retrieval, choices_of, without
+from mfvpr.systems.assembly import GROUPS, KEYS, SystemSettings, by_choice, choices_of, without
 from mfvpr.utils.cluster import Cluster
 from mfvpr.utils.errors import InputError
 from mfvpr.utils.fields import (
@@ -172,10 +172,8 @@ class Learn(Searched):
         super().__post_init__()
         if self.also and not self.report:
             raise InputError("also: expected report=[...] as well, to learn on several data sets and report on others")
-        if self.report and {self.features["name"], *by_retrieval(self.retrieval), self.matching["name"]} & {
-            "import",
-            "pairs",
-        }:
+        names = {self.features["name"], *by_choice("retrieval", self.retrieval), self.matching["name"]}
+        if self.report and names & {"import", "pairs"}:
             raise InputError("report: expected no files of other programs, since they are of one data set")
         if self.report and self.split != "both":
             raise InputError(f"split={self.split}: expected none with report=, since the data sets are it")

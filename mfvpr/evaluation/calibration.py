@@ -1,4 +1,4 @@
-"""What a confidence is fitted on: rankings with known places, and the same queries as images of absent places."""
+"""Data that a confidence is fitted on: rankings with known places, and the same queries as images of absent places."""
 
 import warnings
 from dataclasses import replace
@@ -74,14 +74,14 @@ def fit_on_drive(
 ) -> tuple[Confidence, CalibrationData]:
     """Fit the confidence of the ranking that decides on a data set; also what it was fitted on.
 
-    `rule` replaces that of the retrieval's standardization, if it has one.
-    Each query counts twice: as it is, and without the images of its place, see `calibration_data`.
+    Each query counts twice: as it is, and without the images of its place, see `calibration_data`. The
+    `rule`, if there is one, replaces that of the retrieval's standardization.
     """
     truth, root, cache = dataset.only.truth, dataset.queries.root, cache or FeatureCache()
     if truth is None:
         raise InputError(f"{dataset.name}: expected a ground truth, which says what is correct, got none")
     if rule is not None:
-        pipeline = replace(system.pipeline, retriever=with_standardization(system.pipeline.retriever, rule))
+        pipeline = replace(system.pipeline, retriever=with_standardization(system.pipeline.retriever, lambda _: rule))
         system = replace(system, pipeline=pipeline)
     result, threshold = rank_dataset(dataset, system, cache=cache), middle(truth.thresholds())
     [ranked] = result.systems[system.headline]

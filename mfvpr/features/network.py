@@ -150,7 +150,7 @@ class GlobalDescriptor(NetworkExtractor):
 class EfficientNetDescriptor(NetworkExtractor):
     """The map of a block of EfficientNet-Lite0, averaged to a square grid and scaled to unit length, float16.
 
-    Middle blocks describe places better than the last ones: on GRIEF and the corridor, block 10 has the best R@1.
+    Middle blocks describe places better than the last ones, see features/README.md.
     """
 
     image_size: tuple[int, int] = setting((160, 160), SIZE, "width, height")

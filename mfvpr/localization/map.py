@@ -155,12 +155,11 @@ class Map:
     ) -> Confidence:
         """Fit the confidence on a drive, and keep it in the folder of the map.
 
-        `route` says whether it is for images of a drive with a `Route`, or for single ones, where the retrieval
-        standardizes descriptors: the candidates are others.
         It holds for drives like this one. Correct is a prediction within 2 frames, or 25 m. Each query counts once more
         without the images of its place, as one of a place that the map does not show. `database` is a folder of images
         along a path, preferably another than that of the map, `queries` one of a drive along this path; for
-        `ground_truth`, see `mfvpr.datasets.folder`. The cache keeps features.
+        `ground_truth`, see `mfvpr.datasets.folder`. The cache keeps features. If the retrieval standardizes
+        descriptors, it holds either with a `route` or for images without one.
         """
         dataset = folder_dataset(database, queries, ground_truth=ground_truth)
         self.confidence, data = fit_on_drive(dataset, self.system, cache, self._rule_of(route))
@@ -191,11 +190,12 @@ class Map:
             route: of the drive that the image is the next one of; the prediction is then `located` on it.
 
         Raises:
-            InputError: the map is empty, the image cannot be read, `recent` or `before` is no number of rows, or
-                `route` is no `Route`.
+            InputError: the map is empty, the image cannot be read, `recent` or `before` is no number of rows, `route`
+                is no `Route`, or as `require_confidence` says.
         """
         if not isinstance(route, Route | None):
             raise InputError(f"route: expected Route(), the same for all images of a drive, got {route!r}")
+        self.require_confidence(route is not None)
         _ROWS.check("recent", recent)
         _ROWS.check("before", 0 if before is None else before)
         with self._lock:
@@ -203,11 +203,8 @@ class Map:
             pixels, total = query_steps.load(image), len(self)
             described, resized = self.describing.pixels(pixels)
             end = max(0, (total if before is None else min(int(before), total)) - int(recent))
-            reason, rule = reason_against_image(resized), self._rule_of(route is not None)
-            if self.confidence is not None and rule and self.confidence.standardize not in (None, rule):
-                got = f"{self.confidence.standardize}; calibrate with route={route is not None}"
-                raise InputError(f"confidence: expected one that was fitted with standardize={rule}, got {got}")
-            if route is not None and rule == "running" and reason is None:
+            reason = reason_against_image(resized)
+            if route is not None and self._rule_of(True) == "running" and reason is None:
                 route.see(described[1])
             localized = self._localize(described, end, pixels.shape[1::-1], reason, route)
             if route is None:
@@ -218,6 +215,14 @@ class Map:
             if located is not None and located.row is None:
                 prediction = prediction.without_place("off the map")
             return localized._replace(prediction=prediction)
+
+    def require_confidence(self, route: bool) -> None:
+        """Raise an InputError if the confidence was fitted on candidates that images with, or without, a route lack."""
+        rule, fitted = self._rule_of(route), self.confidence and self.confidence.standardize
+        if rule and fitted not in (None, rule):
+            mend = "with route=True (mfvpr map calibrate --route)" if route else "without route=True"
+            got = f"{fitted}; calibrate {mend}"
+            raise InputError(f"confidence: expected one that was fitted with standardize={rule}, got {got}")
 
     def warm_up(self) -> None:
         """Compile what `localize` needs for images like those of the map; an InputError for an empty map."""

@@ -1,4 +1,4 @@
-"""What a map keeps of its system: settings, recipes, the size of images."""
+"""Parts of a system that a map keeps: settings, recipes, the size of images."""
 
 import json
 from pathlib import Path

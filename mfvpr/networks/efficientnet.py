@@ -12,7 +12,8 @@ from jax import lax
 from jaxtyping import Float
 
 from mfvpr.core.types import Array
-from mfvpr.networks.layers import PRECISION, Images, Linear, Pixels, sum_of_shifts
+from mfvpr.networks import layers
+from mfvpr.networks.layers import PRECISION, Images, Linear, Pixels
 
 _STEM = 32  # channels
 _STAGES = (  # number of blocks; kernel, stride of the first block, expansion, channels
@@ -26,7 +27,7 @@ _STAGES = (  # number of blocks; kernel, stride of the first block, expansion, c
 )
 CHANNELS = tuple(channels for number, *_, channels in _STAGES for _ in range(number))  # of each block's map
 
-BatchNorm = partial(nnx.BatchNorm, use_running_average=True, epsilon=1e-3)
+BatchNorm = partial(layers.BatchNorm, epsilon=1e-3)
 
 
 class EfficientNetLite0(nnx.Module):
@@ -64,14 +65,13 @@ class InvertedBottleneck(nnx.Module):
         if self.expands:
             self.expand, self.expand_bn = Linear(inputs, width, use_bias=False, rngs=rngs), BatchNorm(width, rngs=rngs)
         kernel = nnx.initializers.he_normal()(rngs.params(), (size, size, 1, width), jnp.float32)
-        self.depthwise, self.depthwise_bn = nnx.Dict(kernel=nnx.Param(kernel)), BatchNorm(width, rngs=rngs)
+        self.depthwise, self.depthwise_bn = nnx.Param(kernel), BatchNorm(width, rngs=rngs)
         self.project, self.project_bn = Linear(width, outputs, use_bias=False, rngs=rngs), BatchNorm(outputs, rngs=rngs)
 
     def __call__(self, x: Float[Array, "batch rows columns inputs"]) -> Float[Array, "batch _ _ outputs"]:
         wide = nnx.relu6(self.expand_bn(self.expand(x))) if self.expands else x
-        kernel, convolve = self.depthwise["kernel"][...], partial(_sum_of_shifts, stride=self.stride)
-        grouped = partial(_grouped, stride=self.stride)
-        wide = lax.platform_dependent(wide, kernel, cpu=convolve, default=grouped)
+        shifts, grouped = (partial(convolve, stride=self.stride) for convolve in (_sum_of_shifts, _grouped))
+        wide = lax.platform_dependent(wide, self.depthwise[...], cpu=shifts, default=grouped)
         narrow = self.project_bn(self.project(nnx.relu6(self.depthwise_bn(wide))))
         return x + narrow if self.has_shortcut else narrow
 
@@ -82,7 +82,7 @@ def _sum_of_shifts(x: Array, kernel: Array, stride: int) -> Array:
     rows, columns = (-(-side // stride) for side in sides)
     missing = [max((steps - 1) * stride + size - side, 0) for steps, side in zip((rows, columns), sides, strict=True)]
     x = jnp.pad(x, ((0, 0), *((each // 2, each - each // 2) for each in missing), (0, 0)))
-    return sum_of_shifts(x, kernel, stride)
+    return layers.sum_of_shifts(x, kernel, stride)
 
 
 def _grouped(x: Array, kernel: Array, stride: int) -> Array:

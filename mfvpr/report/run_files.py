@@ -84,9 +84,8 @@ def heading(report: EvaluationReport, description: RunDescription) -> str:
 
 
 def standardizations_of(report: EvaluationReport) -> list[str]:
-    """The rules by which the retrieval standardized descriptors, of all sequences."""
-    retriever = report.ranked.system.pipeline.retriever
-    return sorted({rule for each in report.sequences for rule in standardizations(retriever, each)})
+    """The rules by which the retrieval standardized descriptors."""
+    return sorted(standardizations(report.ranked.system.pipeline.retriever, report.sequences))
 
 
 def matched_content(settings: Mapping[str, Any]) -> str:

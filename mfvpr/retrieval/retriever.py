@@ -1,6 +1,6 @@
 """Retrieval (the paper's filter): candidates for each query; what it learns from the database, it learns once."""
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, fields, is_dataclass, replace
 from typing import TYPE_CHECKING, Any, NamedTuple, Protocol, TypeVar
 
@@ -13,7 +13,7 @@ from mfvpr.datasets.positives import Positives
 from mfvpr.features.extractor import Aggregated, Extractor, describe_folder
 from mfvpr.features.whitening import Whitening, WindowFitting, origin
 from mfvpr.retrieval.search import EXACT
-from mfvpr.retrieval.standardization import Rule, Search, StandardizedSearch
+from mfvpr.retrieval.standardization import Rule, Search, StandardizedSearch, rule_of_sequence
 from mfvpr.storage.cache_files import CacheFiles
 from mfvpr.storage.feature_cache import FeatureCache
 
@@ -169,24 +169,22 @@ def fit_to_database(tool: Tool, database: ImageFolder, cache: FeatureCache) -> T
 
 def fit_to_sequence(tool: Any, sequence: QuerySequence) -> Any:
     """The retrieval with the rule of standardization that `auto` stands for with this sequence."""
+    return with_standardization(tool, lambda rule: rule_of_sequence(rule, sequence))
+
+
+def with_standardization(tool: Any, change: Callable[[Rule], Rule]) -> Any:
+    """The retrieval with changed rules of standardization where it has some."""
     if isinstance(tool, StandardizedSearch):
-        return tool.of(sequence)
-    return with_parts(tool, lambda part: fit_to_sequence(part, sequence))
+        return StandardizedSearch(change(tool.standardize))
+    return with_parts(tool, lambda part: with_standardization(part, change))
 
 
-def with_standardization(tool: Any, rule: Rule) -> Any:
-    """The retrieval with another rule of standardization where it has one."""
+def standardizations(tool: Any, sequences: Sequence[QuerySequence]) -> set[Rule]:
+    """The rules by which a retrieval, or its parts, standardize descriptors for these sequences."""
     if isinstance(tool, StandardizedSearch):
-        return StandardizedSearch(rule)
-    return with_parts(tool, lambda part: with_standardization(part, rule))
-
-
-def standardizations(tool: Any, sequence: QuerySequence) -> set[str]:
-    """The rules by which a retrieval, or its parts, standardize descriptors for this sequence."""
-    if isinstance(tool, StandardizedSearch):
-        return {tool.of(sequence).standardize}
+        return {rule_of_sequence(tool.standardize, each) for each in sequences}
     parts = [getattr(tool, part.name) for part in fields(tool)] if is_dataclass(tool) else []
-    return {rule for part in parts for rule in standardizations(part, sequence)}
+    return {rule for part in parts for rule in standardizations(part, sequences)}
 
 
 def with_parts(whole: Any, change: Callable[[Any], Any]) -> Any:

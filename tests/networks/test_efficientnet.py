@@ -68,7 +68,7 @@ def test_a_block_is_that_of_loops(inputs, outputs, expansion, size, stride, shap
     wide = x
     if expansion > 1:
         wide = relu6(normalized(block.expand_bn, x @ np.asarray(block.expand.kernel[...], float)))
-    kernel = np.asarray(block.depthwise["kernel"][...], float)[:, :, 0]
+    kernel = np.asarray(block.depthwise[...], float)[:, :, 0]
     wide = relu6(normalized(block.depthwise_bn, depthwise(wide, kernel, stride)))
     expected = normalized(block.project_bn, wide @ np.asarray(block.project.kernel[...], float))
     if stride == 1 and inputs == outputs:

@@ -49,7 +49,11 @@ def test_two_files_of_one_folder_are_refused(tmp_path, change, refused):
     common = {"database": "a.h5", "queries": "a.h5", "database_prefix": "", "query_prefix": "", "lengths": "unit"}
     for group, build_stage, defaults in (
         ("features", assembly.extractor, {"image_size": None}),
-        ("retrieval", lambda *options: assembly.retriever(*options[:1], SimpleNamespace(), data), {"whiten": None}),
+        (
+            "retrieval",
+            lambda *options: assembly.retriever(*options[:1], SimpleNamespace(), data),
+            {"whiten": None, "standardize": "none"},
+        ),
     ):
         settings = {"name": "import"} | common | defaults | change
         if not refused:

@@ -5,7 +5,8 @@ import pytest
 
 from mfvpr.core.types import Shortlist
 from mfvpr.datasets import FrameTruth, QuerySequence, RadiusTruth
-from mfvpr.retrieval import Alternating, RetrievalResult, StandardizedSearch
+from mfvpr.retrieval import Alternating, Retrieval, RetrievalResult, StandardizedSearch
+from mfvpr.retrieval.retriever import fit_to_sequence, standardizations
 from mfvpr.retrieval.standardization import PRIOR, GrowingDatabase, Moments, standardize
 
 RNG = np.random.default_rng(0)
@@ -90,8 +91,10 @@ def test_equal_descriptors_are_no_reason_to_fail(rule):
 )
 def test_auto_is_the_drive_where_frames_count(truth, rule):
     sequence = QuerySequence("walk", None, truth)  # pyright: ignore[reportArgumentType]
-    assert StandardizedSearch("auto").of(sequence) == StandardizedSearch(rule)
-    assert StandardizedSearch("running").of(sequence) == StandardizedSearch("running")
+    both = Alternating(Retrieval(None, StandardizedSearch("auto")), Retrieval(None, StandardizedSearch("running")))
+    fitted = fit_to_sequence(both, sequence)
+    assert [each.search.standardize for each in (fitted.first, fitted.second)] == [rule, "running"]
+    assert standardizations(both, [sequence]) == {rule, "running"}
 
 
 @pytest.mark.parametrize("size", [3, 15, 16, 17, 30])
