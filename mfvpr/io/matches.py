@@ -81,7 +81,7 @@ class ImportedMatches:
             if not self._use_confidences or not first.size:
                 confidence = None
             elif self._has_confidences not in (None, confidence is not None):
-                raise InputError(f"{where}: expected confidences of all pairs or of none, got some; see confidences=")
+                raise InputError(f"{where}: expected confidences of all pairs or none, got some; set confidences=False")
             else:
                 self._has_confidences = confidence is not None
             if self.numbered:
@@ -130,7 +130,7 @@ class ImportedMatches:
         """Size of the image that points are in; an InputError if nobody knows it."""
         if stored is not None and self._image_size is not None and tuple(stored) != tuple(self._image_size):
             expected = f"the argument image_size={list(self._image_size)}"
-            raise InputError(f"{self.path}: expected {expected}, got {list(stored)}; leave it out")
+            raise InputError(f"{self.path}: expected {expected}, got {list(stored)}; leave image_size out")
         size_of = self._sides[side].size if self._files.in_image_files else None
         size = stored or self._image_size or (size_of and size_of(row))
         if size is None or not all(isinstance(length, int | float) and 0 < length < np.inf for length in size):

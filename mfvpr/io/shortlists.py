@@ -113,9 +113,9 @@ def write_shortlist(
     require_word("layout", layout, PairLayout)
     indices, scores, mask = (np.asarray(part) for part in (shortlist.indices, shortlist.scores, shortlist.mask))
     if len(indices) != len(query_names):
-        raise InputError(f"{path}: expected names of {len(indices)} queries, got {len(query_names)}; name all queries")
+        raise InputError(f"{path}: expected names of {len(indices)} queries, got {len(query_names)}; name them")
     if indices.max(initial=-1) >= len(database_names):
-        raise InputError(f"{path}: expected database rows below {len(database_names)}, got {indices.max()}; name all")
+        raise InputError(f"{path}: expected database rows below {len(database_names)}, got {indices.max()}; name them")
     is_npz = path.suffix.lower() == ".npz"
     for query in range(len(indices)) if is_npz or layout == "kapture" else ():
         _descending(f"{path}: {shorten(query_names[query])}", scores[query][mask[query]])

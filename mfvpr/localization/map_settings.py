@@ -35,7 +35,7 @@ def describers_of(system: System) -> tuple[Extractor, Extractor | VladFitting]:
         "a matcher that JAX can compile": not isinstance(pipeline.matcher, PairSource),
         "a number of candidates": pipeline.candidates != "all",
         "single images; mfvpr.Route follows a drive": not (system.correlated or system.sequences),
-        "retrieval by global descriptors without whitening": isinstance(
+        "one retrieval by global descriptors without whitening": isinstance(
             getattr(retriever, "search", None), ExactSearch | StandardizedSearch
         ),
         "descriptors of an extractor, or Aggregated(extractor, VladFitting()) of its own": is_own,
