@@ -173,7 +173,7 @@ def test_confidences_of_all_pairs_or_of_none(tmp_path):
     npz_folder(tmp_path, "q1_d1.npz", points0=POINTS, points1=POINTS, confidence=[0.5] * 3)
     folder = npz_folder(tmp_path, "q1_d2.npz", points0=POINTS, points1=POINTS)
     sides = Images(["q1.jpg"]), Images(["d1.jpg", "d2.jpg"])
-    with one_line_error("of all pairs or of none"):
+    with one_line_error("expected confidences of all pairs or none, got some"):
         open_matches(folder, *sides, image_size=(64, 64)).read(0, [0, 1])
     read = open_matches(folder, *sides, image_size=(64, 64), confidences=False).read(0, [0, 1])
     assert all((matches.confidence == 1).all() for matches in read)
