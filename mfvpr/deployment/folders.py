@@ -21,6 +21,7 @@ from mfvpr.core.scorer import Scorer
 from mfvpr.core.types import Array
 from mfvpr.deployment.programs import ExportShapes, Program, Tensor, make_program
 from mfvpr.evaluation.system import System
+from mfvpr.features.network import XFeatFeatures
 from mfvpr.io.containers import reading
 from mfvpr.utils.errors import InputError
 from mfvpr.utils.files import write_text
@@ -70,23 +71,25 @@ class ExportedProgram:
 
 def export(
     folder: Path | str,
-    method: Scorer | System,
+    method: Scorer | System | XFeatFeatures,
     shapes: ExportShapes,
     *,
     with_shift: bool = False,
     with_confidence: bool = False,
     onnx: bool | None = None,
 ) -> ExportedProgram:
-    """Write a scorer, or the matcher and scorers of a system, as a program that runs without Python.
+    """Write a scorer, the matcher and scorers of a system, or an extractor as a program that runs without Python.
 
         shapes = mfvpr.ExportShapes(candidates=50, keypoints=800, image_size=(640, 480))
         program = mfvpr.export("exported", mfvpr.HistogramOfShifts(), shapes)
 
-    The program scores all candidates of one query. The page of `mfvpr.deployment` lists files, inputs and limits.
+    The program scores all candidates of one query, or extracts the keypoints of one image. The page of
+    `mfvpr.deployment` lists files, inputs and limits.
 
     Args:
         folder: new or empty.
-        method: a scorer takes matches; a system takes features, and returns the scores of all of its scorers.
+        method: a scorer takes matches; a system takes features, and returns the scores of all of its scorers;
+            an `XFeatFeatures` takes an image of its size, uint8.
         shapes: sizes of all arrays.
         with_shift: also return the refined dominant shifts of the deciding `HistogramOfShifts`, `[C, 2]` px.
         with_confidence: whether a scorer takes the confidence of each match; if not, matches count fully.
@@ -104,7 +107,8 @@ def export(
         program = without_unused_inputs(program)
         content = bytes(export_program(program).serialize())
         inputs = check_inputs(program)
-        values = jax.jit(jax_export.deserialize(bytearray(content)).call)(*inputs.values())
+        run = jax.jit(jax_export.deserialize(bytearray(content)).call)
+        values = run(*inputs.values())
         outputs = {each.name: np.asarray(array) for each, array in zip(program.outputs, values, strict=True)}
         model, onnx_note = None, {"missing": "not requested" if onnx is False else "jax2onnx is not installed"}
         if onnx or (onnx is None and find_spec("jax2onnx")):
@@ -141,7 +145,7 @@ def export(
         np.save(folder / CHECK / f"{name}.npy", array, allow_pickle=False)
     # The description comes last: a folder without it is not loaded.
     write_text(folder / DESCRIPTION, json.dumps(description, indent=2, allow_nan=False) + "\n")
-    return load_exported(folder)
+    return replace(load_exported(folder), run=run)  # compiled
 
 
 def load_exported(folder: Path | str) -> ExportedProgram:
@@ -243,7 +247,10 @@ def _require_sizes(arrays: Mapping[str, np.ndarray]) -> None:
 
 
 def check_inputs(program: Program) -> dict[str, np.ndarray]:
-    """Inputs by name: candidates of one place, each less precise than the one before, the last without matches."""
+    """Inputs by name: candidates of one place, each less precise than the one before, the last without matches.
+
+    The image has few keypoints, whose scores differ by more than rounding errors: those define the order.
+    """
     lengths = num_candidates, num_keypoints = program.shapes.candidates, program.shapes.keypoints
     rng, size = np.random.default_rng(0), np.asarray(program.shapes.image_size, np.float32)
     spread = 0.01 * (1 + np.arange(num_candidates))[:, None, None]  # of image size and descriptors
@@ -254,7 +261,11 @@ def check_inputs(program: Program) -> dict[str, np.ndarray]:
     changed = descriptors + spread * rng.normal(size=(num_candidates, *descriptors.shape))
     mask = rng.uniform(size=lengths) < 0.9
     mask[-1] = num_candidates == 1
+    width, height = size.astype(int)
+    image = np.full((height, width, 3), 128)
+    image[:32, :32] = rng.integers(0, 256, (8, 8, 3)).repeat(4, 0).repeat(4, 1)[:height, :width]
     values = {
+        "image": image,
         "distance": rng.uniform(0, 1, lengths),
         "ratio": rng.uniform(0.5, 1, lengths),
         "confidence": np.linspace(0, 1, mask.size).reshape(lengths),
@@ -281,7 +292,8 @@ def largest_difference(arrays: dict[str, np.ndarray], expected: dict[str, np.nda
     for name, values in expected.items():
         if not np.array_equal(np.isfinite(arrays[name]), finite := np.isfinite(values)):
             return np.inf
-        difference = np.abs(arrays[name][finite] - values[finite]) / np.maximum(np.abs(values[finite]), 1)
+        difference = np.abs(np.subtract(arrays[name][finite], values[finite], dtype=float))
+        difference /= np.maximum(np.abs(values[finite]), 1)
         differences.append(float(np.max(difference, initial=0.0)))
     return max(differences)
 

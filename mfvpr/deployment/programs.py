@@ -1,4 +1,4 @@
-"""Functions of arrays that are exported: scores of matches, or of the features of a query and its candidates."""
+"""Functions of arrays that are exported: keypoints of an image, and scores of matches or of features."""
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, fields, replace
@@ -8,12 +8,14 @@ from typing import Any, Literal, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
+from flax import nnx
 
 from mfvpr.core.batch import BIN_STEP
 from mfvpr.core.histogram import HistogramOfShifts
 from mfvpr.core.scorer import Scorer, fit_capacities, on_host, require_scores
 from mfvpr.core.types import Array, Features, Matches
 from mfvpr.evaluation.system import System
+from mfvpr.features.network import XFeatFeatures
 from mfvpr.matchers.host_matcher import PairSource
 from mfvpr.utils.errors import InputError
 from mfvpr.utils.fields import COUNT, POSITIVE, list_of
@@ -22,7 +24,7 @@ Form = Literal["vectorized", "loop"]
 
 # Axes, types and units of the fields of `Matches` and `Features`, without 0 and 1 and the candidates' axis C.
 _AXES = {"points": "K2", "keypoints": "K2", "descriptors": "KD", "image_size": "2", "count": ""}  # others: "K"
-_TYPES = {"mask": "bool", "index": "int32", "count": "int32"}  # others: "float32"
+_TYPES = {"mask": "bool", "index": "int32", "count": "int32", "image": "uint8"}  # others: "float32"
 _PIXELS = ("points", "keypoints", "image_size", "shift")
 _OF_QUERY = ("image_size0", "count0")  # fields of matches that all candidates share
 
@@ -38,7 +40,8 @@ class ExportShapes:
 
     candidates: int  # C, of one query; fill up with candidates whose mask is False
     keypoints: int  # K, of each image; of a scorer alone: match slots of each pair
-    image_size: tuple[float, float]  # largest (width, height), px; the capacities of histograms follow from it
+    image_size: tuple[float, float]  # largest (width, height), px; the capacities of histograms follow from it;
+    # of an extractor: its own
     dimension: int | None = None  # D, of a descriptor; None = the extractor's
 
     def __post_init__(self) -> None:
@@ -59,7 +62,8 @@ class Tensor(NamedTuple):
     @classmethod
     def of(cls, name: str, axes: str, shapes: ExportShapes) -> "Tensor":
         """The tensor of a name with these axes."""
-        lengths = {"C": shapes.candidates, "K": shapes.keypoints, "D": shapes.dimension or 0, "2": 2}
+        lengths = {"C": shapes.candidates, "K": shapes.keypoints, "D": shapes.dimension or 0, "2": 2, "3": 3}
+        lengths |= dict(zip("WH", map(int, shapes.image_size), strict=True))
         field = name.rstrip("01")
         shape = tuple(lengths[axis] for axis in axes)
         return cls(name, shape, _TYPES.get(field, "float32"), "px" if field in _PIXELS else "", axes)
@@ -70,13 +74,14 @@ class Program:
     """A function of arrays in the order of `inputs` that returns arrays in the order of `outputs`.
 
     `form` is how it goes over the candidates: "vectorized", or a "loop", which converters to other formats understand.
+    An extractor then has direct convolutions.
     """
 
     shapes: ExportShapes
     inputs: tuple[Tensor, ...]
     outputs: tuple[Tensor, ...]
     function: Callable[[dict[str, Array], Form], tuple[Array, ...]]
-    parameters: Mapping[str, Any]  # scorers by output, and the matcher
+    parameters: Mapping[str, Any]  # scorers by output and the matcher, or the extractor
     left_out: tuple[str, ...] = ()  # rankings of the system that the program does not score
 
     def call(self, *arrays: Array, form: Form = "vectorized") -> tuple[Array, ...]:
@@ -85,12 +90,16 @@ class Program:
 
 
 def make_program(
-    method: Scorer | System, shapes: ExportShapes, *, with_shift: bool, with_confidence: bool = False
+    method: Scorer | System | XFeatFeatures, shapes: ExportShapes, *, with_shift: bool, with_confidence: bool = False
 ) -> Program:
-    """The program of a scorer, or of all scorers of a system, with the capacities that images of this size need.
+    """The program of an extractor, a scorer, or all scorers of a system, with the capacities for images of this size.
 
     The scores of the scorer that decides come first. An `InputError` says why a method cannot be exported.
     """
+    if isinstance(method, XFeatFeatures):
+        if with_shift or with_confidence:
+            raise InputError("with_shift, with_confidence: expected a scorer or a system, got an extractor")
+        return _make_extraction(method, shapes)
     matcher: Any = None
     scorers, left_out = {"scores": method}, ()
     names = [each.name for each in fields(Matches) if with_confidence or each.name != "confidence"]
@@ -147,6 +156,28 @@ def make_program(
     outputs += (Tensor.of("shift", "C2", shapes),) if with_shift else ()
     parts = scorers if matcher is None else {**scorers, "matcher": matcher}
     return Program(shapes, inputs, outputs, score_features if matcher else score_matches, parts, left_out)
+
+
+def _make_extraction(extractor: XFeatFeatures, shapes: ExportShapes) -> Program:
+    """The program that returns the strongest keypoints of an image by falling score; padding is 0."""
+    size, most = extractor.image_size, extractor.slots(shapes.keypoints)
+    if tuple(shapes.image_size) != tuple(size):
+        raise InputError(f"image_size={[*shapes.image_size]}: expected that of the extractor, {[*size]}")
+    if shapes.keypoints > most:
+        raise InputError(f"keypoints={shapes.keypoints}: expected at most {most}, the extractor's max_keypoints")
+    shapes = replace(shapes, dimension=extractor.model.dimension)
+
+    def extract(arrays: dict[str, Array], form: Form) -> tuple[Array, ...]:
+        model = nnx.clone(extractor.model)
+        model.set_attributes(is_direct=form == "loop")
+        (batch,) = extractor.compute(model, arrays["image"][None], slots=shapes.keypoints)
+        result = jax.tree.map(lambda leaf: leaf[0], batch)
+        vectors = (jnp.where(result.mask[:, None], each, 0) for each in (result.keypoints, result.descriptors))
+        return (*vectors, result.scores, result.mask)
+
+    table = {name: _AXES.get(name, "K") for name in ("keypoints", "descriptors", "scores", "mask")}
+    outputs = tuple(Tensor.of(name, axes, shapes) for name, axes in table.items())
+    return Program(shapes, (Tensor.of("image", "HW3", shapes),), outputs, extract, {"extractor": extractor})
 
 
 def _dimension(system: System, shapes: ExportShapes) -> int:

@@ -30,10 +30,13 @@ _WIDE = 24  # least input channels for which Winograd's method is faster on a CP
 
 
 class Layer(nnx.Module):
-    """Convolution, batch normalization without scale and shift, ReLU."""
+    """Convolution, batch normalization without scale and shift, ReLU.
+
+    `model.set_attributes(is_direct=True)`: XLA's own convolutions on every device, as exporters to ONNX need them.
+    """
 
     def __init__(self, inputs: int, outputs: int, size: int = 3, stride: int = 1, *, rngs: nnx.Rngs) -> None:
-        self.stride = stride
+        self.stride, self.is_direct = stride, False
         self.conv = (
             layers.conv(inputs, outputs, stride=stride, rngs=rngs)
             if size == 3
@@ -46,7 +49,7 @@ class Layer(nnx.Module):
 
     def _convolve(self, x: Array) -> Array:
         """Convolve a map. On a CPU, XLA's own convolution takes 2 to 20 times as long for up to 4 channels."""
-        if isinstance(self.conv, nnx.Linear):
+        if isinstance(self.conv, nnx.Linear) or self.is_direct:
             return self.conv(x)
         if x.shape[-1] <= 4:
             fast = partial(_sum_of_shifts, stride=self.stride)
