@@ -9,63 +9,52 @@ import mfvpr
 from mfvpr import ExportShapes, InputError
 from mfvpr.checkpoints import entry_of, is_installed, load_model
 from mfvpr.features import XFeatFeatures
+from tests.builders import local
 from tests.golden.make_d2net import texture
 from tests.needs import needs
 from tests.networks.checkpoints import fill_published
 from tests.random_checkpoints import random_checkpoint, xfeat_shapes
 
 pytestmark = pytest.mark.thorough
-
-SIZE = (96, 64)
-SHAPES = ExportShapes(candidates=1, keypoints=100, image_size=SIZE)
+SIZE, SHAPES = (96, 64), ExportShapes(candidates=1, keypoints=100, image_size=(96, 64))
 
 
 @pytest.fixture(scope="module", params=["random", pytest.param("real", marks=pytest.mark.slow)])
 def extractor(request):
-    """With random weights and a threshold that fits them, or with the public ones."""
-    if request.param == "random":
+    if request.param == "random":  # with a threshold that fits the weights
         return XFeatFeatures(fill_published("xfeat", random_checkpoint(xfeat_shapes())), SIZE, threshold=0.03)
     if not is_installed(entry_of("xfeat")):
         pytest.skip("needs weights: mfvpr weights download xfeat")
     return XFeatFeatures(load_model("xfeat"), SIZE)
 
 
-def test_a_reloaded_extraction_gives_the_features_of_the_extractor(extractor, tmp_path):
-    program = mfvpr.export(tmp_path / "xfeat", extractor, SHAPES, onnx=False)  # reads the folder
-    assert [(each.name, each.shape, each.dtype, each.unit) for each in (*program.inputs, *program.outputs)] == [
-        ("image", (64, 96, 3), "uint8", ""),
-        ("keypoints", (100, 2), "float32", "px"),
-        ("descriptors", (100, 64), "float32", ""),
-        ("scores", (100,), "float32", ""),
-        ("mask", (100,), "bool", ""),
-    ]
-    plain, full = np.full((64, 96, 3), 128, np.uint8), texture(*SIZE)
-    images = np.stack([full, np.concatenate([full[:32], plain[32:]])])
-    for image, description in zip(images, extractor(images), strict=True):
-        (features,) = description.local
-        outputs = program(image=image)
-        count = min(len(features.scores), 100)
-        assert outputs["mask"].tolist() == [True] * count + [False] * (100 - count)
-        for name in ("keypoints", "descriptors", "scores"):
-            np.testing.assert_allclose(outputs[name][:count], getattr(features, name)[:count], atol=1e-6)
-            assert not outputs[name][count:].any()
+def test_a_program_gives_the_features_of_the_extractor_and_zeros(extractor, tmp_path):
+    program = mfvpr.export(tmp_path / "xfeat", extractor, SHAPES, onnx=False)
+    shapes = {each.name: (*each.shape, each.dtype) for each in (*program.inputs, *program.outputs)}
+    vectors = {"keypoints": (100, 2, "float32"), "descriptors": (100, 64, "float32"), "scores": (100, "float32")}
+    assert shapes == {"image": (64, 96, 3, "uint8"), **vectors, "mask": (100, "bool")}
+    plain = np.pad(texture(16, 16), ((0, 48), (0, 80), (0, 0)), constant_values=128)
+    counts = []
+    for image in (texture(*SIZE), plain):
+        outputs, [features] = program(image=image), local(extractor(image[None]))
+        counts.append(min(len(features.scores), 100))
+        assert outputs["mask"].tolist() == [row < counts[-1] for row in range(100)]
+        for name in vectors:  # two compilations of one network: equal but for the last bits
+            np.testing.assert_allclose(outputs[name][: counts[-1]], getattr(features, name)[:100], atol=1e-6)
+            assert not outputs[name][counts[-1] :].any()
+    assert counts[0] == 100 > counts[1] > 3
 
 
 @needs("jax2onnx")
 def test_onnx_runtime_gives_the_same_keypoints(extractor, tmp_path):
-    program = mfvpr.export(tmp_path / "xfeat", extractor, SHAPES, onnx=True)
-    assert program.description["onnx"]["largest_difference"] < 1e-5
-    assert np.load(tmp_path / "xfeat" / "check" / "mask.npy").sum() > 5
+    mfvpr.export(tmp_path / "xfeat", extractor, SHAPES, onnx=True)  # compares the outputs
+    assert 10 < np.load(tmp_path / "xfeat" / "check" / "mask.npy").sum() < 100
 
 
-@pytest.mark.parametrize(
-    ("shapes", "options", "message"),
-    [
-        ({"image_size": (64, 96)}, {}, r"image_size=\[64, 96\]: expected that of the extractor, \[96, 64\]"),
-        ({"keypoints": 2000}, {}, "keypoints=2000: expected at most 1000, the extractor's max_keypoints"),
-        ({}, {"with_shift": True}, "with_shift, with_confidence: expected a scorer or a system, got an extractor"),
-    ],
-)
-def test_extractions_that_cannot_be_exported_are_refused(extractor, tmp_path, shapes, options, message):
-    with pytest.raises(InputError, match=message):
-        mfvpr.export(tmp_path / "xfeat", extractor, replace(SHAPES, **shapes), **options)
+def test_shapes_and_options_that_do_not_fit_are_refused(extractor, tmp_path):
+    with pytest.raises(InputError, match=r"image_size=\[64, 96\]: expected that of the extractor, \[96, 64\]"):
+        mfvpr.export(tmp_path / "xfeat", extractor, replace(SHAPES, image_size=(64, 96)))
+    with pytest.raises(InputError, match="keypoints=2000: expected at most 1000, the extractor's max_keypoints"):
+        mfvpr.export(tmp_path / "xfeat", extractor, replace(SHAPES, keypoints=2000))
+    with pytest.raises(InputError, match="with_shift, with_confidence: expected a scorer or a system, got an extr"):
+        mfvpr.export(tmp_path / "xfeat", extractor, SHAPES, with_shift=True)
