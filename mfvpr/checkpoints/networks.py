@@ -11,11 +11,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
-import yaml
 
-from mfvpr.checkpoints import conversion
-from mfvpr.checkpoints.conversion import RUNTIME, Table, convert
+from mfvpr.checkpoints.conversion import RUNTIME, TABLES, Table, convert
 from mfvpr.utils.errors import InputError
+from mfvpr.utils.files import read_yaml
 
 if TYPE_CHECKING:
     from flax import nnx
@@ -57,9 +56,7 @@ class Entry:
 
 def _published() -> Iterator[Entry]:
     """The entries of published.yaml, which says what its values are."""
-    text = Path(__file__).with_name("published.yaml").read_text(encoding="utf-8")
-    networks = yaml.load(text, getattr(yaml, "CSafeLoader", yaml.SafeLoader))  # eight times as fast
-    for network, of_network in networks.items():
+    for network, of_network in read_yaml(Path(__file__).with_name("published.yaml")).items():
         for name, of_weights in of_network["weights"].items():
             about = {"options": {}, "wheel": None, **of_network, **of_weights}
             yield Entry(
@@ -71,7 +68,7 @@ def _published() -> Iterator[Entry]:
                 about.get("sha256"),
                 *about["licenses"],
                 builder=partial(_constructor, about["model"], about["options"]),
-                table=getattr(conversion, about["table"]),
+                table=TABLES[about["table"]],
                 wheel=about["wheel"] and Wheel(**about["wheel"]),
             )
 

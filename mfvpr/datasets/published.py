@@ -10,13 +10,13 @@ from pathlib import Path, PurePosixPath
 
 import numpy as np
 import scipy  # its subpackages are imported at their first use
-import yaml
 
 from mfvpr.datasets.datasets import Dataset, ImageFolder, QuerySequence, image_folder
 from mfvpr.datasets.ground_truth import FrameTruth, RadiusTruth, Truth, truth_from_file
 from mfvpr.datasets.positives import FARTHEST, positives_within, require_positions
 from mfvpr.io.containers import parse_number, reading
 from mfvpr.utils.errors import InputError
+from mfvpr.utils.files import read_yaml
 
 SEASONS = ("fall", "spring", "summer", "winter")
 REFERENCE = "overcast-summer"  # the paper's figure; its text says overcast-reference, whose images are 6,954
@@ -237,8 +237,7 @@ _READERS = {
 
 def _published() -> Iterator[Published]:
     """The entries of published.yaml, which says what its values are."""
-    text = Path(__file__).with_name("published.yaml").read_text(encoding="utf-8")
-    for name, about in yaml.load(text, getattr(yaml, "CSafeLoader", yaml.SafeLoader)).items():
+    for name, about in read_yaml(Path(__file__).with_name("published.yaml")).items():
         queries, seasons = about["queries"], about.get("seasons")
         yield Published(
             name,
