@@ -140,6 +140,7 @@ def dataset_of(settings: Mapping[str, Any]) -> Dataset:
         truth = LabelFiles(expand_user(settings["query_labels"]), expand_user(settings["database_labels"]))
     paths = [expand_user(path) for path in settings["queries"]] if several else expand_user(settings["queries"])
     options = {name: settings[name] for name in ("name", "orient", "bits")}
+    options |= {name: expand_user(settings[name]) for name in ("masks",) if settings.get(name)}
     return datasets.folder(expand_user(settings["database"]), paths, ground_truth=truth, **options)
 
 
