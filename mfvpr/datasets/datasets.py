@@ -4,6 +4,7 @@ import os
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
+from functools import partial
 from pathlib import Path, PurePosixPath
 
 from mfvpr.datasets.ground_truth import (
@@ -121,7 +122,7 @@ class QuerySequence:
             raise InputError(f"exclude_neighbors={neighbors}: expected queries among the database images, got {got}")
         excluded = FrameTruth(query_rows, num_database).positives(neighbors)
         truth = None if self.truth is None else AllowedTruth(self.truth, excluded)
-        return replace(self, truth=truth, excluded=excluded)
+        return replace(self, truth=truth, excluded=excluded if self.excluded is None else self.excluded | excluded)
 
 
 @dataclass(frozen=True, repr=False)
@@ -231,6 +232,7 @@ def folder(
     orient: bool = True,
     bits: int | None = 16,
     masks: Path | str | None = None,
+    among: Path | str | None = None,
 ) -> Dataset:
     """Folders of images as a data set: one of database images, and one or several of queries.
 
@@ -245,21 +247,27 @@ def folder(
         name: in results.
         orient, bits: see `mfvpr.datasets.image_reading.read_image`.
         masks: of pixels to ignore, see `image_folder`.
+        among: file of pairs as of `IndexFile`, of each query and the only database images that may be its candidates.
     """
     images = image_folder(database, orient=orient, bits=bits, masks=masks)
+    sequence = partial(_sequence, images, ground_truth, among)
     if isinstance(queries, Path | str):
-        return Dataset(name, images, (_sequence(name, images, queries, ground_truth, Path()),))
+        return Dataset(name, images, (sequence(name, queries, Path()),))
     folders = [Path(path) for path in queries]
     names = [(path.resolve() if path.name in ("", "..") else path).name for path in folders]
     if not names or len({*names, *MEANS}) < len(names) + len(MEANS):
         got = ", ".join(names) or "none"
         raise InputError(f"queries: expected folders of different names, none called {' or '.join(MEANS)}, got {got}")
-    sequences = [_sequence(part, images, path, ground_truth, path) for part, path in zip(names, folders, strict=True)]
-    return Dataset(name, images, tuple(sequences))
+    return Dataset(name, images, tuple(map(sequence, names, folders, folders)))
 
 
 def _sequence(
-    name: str, database: ImageFolder, queries: Path | str, ground_truth: GroundTruth | str | None, root: Path
+    database: ImageFolder,
+    ground_truth: GroundTruth | str | None,
+    among: Path | str | None,
+    name: str,
+    queries: Path | str,
+    root: Path,
 ) -> QuerySequence:
     images = image_folder(queries, orient=database.orient, bits=database.bits, masks=database.masks)
     names = images.names, database.names
@@ -282,4 +290,9 @@ def _sequence(
         case _:
             files = "files are given as mfvpr.datasets.IndexFile(FILE) or LabelFiles(QUERIES, DATABASE)"
             raise InputError(f"ground_truth={ground_truth}: expected one of {CHOICES}; {files}")
-    return QuerySequence(name, images, truth)
+    if among is None:
+        return QuerySequence(name, images, truth)
+    allowed = truth_from_file(root / among, *names)
+    if not isinstance(allowed, FrameTruth):
+        raise InputError(f"{root / among}: expected pairs of images, got positions; list the candidates of each query")
+    return QuerySequence(name, images, truth, Positives(~allowed.positives(0).dense()))
