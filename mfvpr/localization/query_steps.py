@@ -67,19 +67,23 @@ class Describing:
 
     def pixels(self, pixels: Pixels) -> tuple[Described, Pixels]:
         """Describe one image; also return it at the size of the extractor."""
-        resized, description = self._extract(self.extractor, pixels)
-        features, vectors = round_as_stored(description.features), list[Any]()
-        for describer in self.describers:
-            if isinstance(describer, Extractor):
-                described = description if describer is self.extractor else self._extract(describer, pixels)[1]
-                vectors.append(described.vector)
+        networks = [each for each in self.describers if isinstance(each, Extractor) and each is not self.extractor]
+        extractors, extract = [self.extractor, *networks], partial(self._extract, pixels)
+        workers = min(len(extractors), available_cpus())
+        extracted = ordered_map(extract, extractors, workers=workers) if workers > 1 and knows_own_context() else None
+        (resized, description), *others = extracted or map(extract, extractors)
+        features = round_as_stored(description.features)
+        vectors, next_vectors = list[Any](), (described.vector for _, described in others)
+        for each in self.describers:
+            if isinstance(each, Vlad):
+                vectors += [*each([features])]
             else:
-                vectors += [*describer([features])]
+                vectors.append(description.vector if each is self.extractor else next(next_vectors))
         if any(vector is None for vector in vectors):
             raise InputError("describer: gives no global descriptor; expected one that does, or VladFitting()")
         return (features, np.concatenate(vectors, axis=None, dtype=np.float32)), resized
 
-    def _extract(self, extractor: Extractor, pixels: Pixels) -> tuple[Pixels, Description]:
+    def _extract(self, pixels: Pixels, extractor: Extractor) -> tuple[Pixels, Description]:
         """An image at the size of an extractor, and its description."""
         resized = resize(pixels, extractor.image_size, extractor.interpolation)
         [description] = describe_images(resized[None], extractor)
