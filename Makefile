@@ -1,4 +1,5 @@
-# `make demo` runs the main job on the embedded data set. Tests: `make test-fast` while editing, `make test` before a
+# `make demo` runs the main job on the embedded data set; `make demo WEIGHTS=1` with learned features, whose weights (about
+# 28 MB) it downloads first. Tests: `make test-fast` while editing, `make test` before a
 # commit, `make test-all` before a release, `make test-wheel` for what is installed.
 PYTHON ?= python3
 CONSTRAINTS ?= /dev/null
@@ -13,7 +14,8 @@ QUICK := JAX_DISABLE_MOST_OPTIMIZATIONS=1 XLA_FLAGS="`cat .venv/.flags`"
 .PHONY: demo test test-fast test-all test-wheel setup check benchmark clean
 
 demo: setup
-	$(BIN)/mfvpr evaluate scorer=demo
+	$(if $(WEIGHTS),$(BIN)/mfvpr weights download recommended)
+	$(BIN)/mfvpr evaluate $(if $(WEIGHTS),system=mfvpr) scorer=demo
 
 test-fast: .venv/.test .venv/.flags
 	$(QUICK) $(PYTEST) -m 'not (slow or thorough or optimized)'

@@ -127,9 +127,10 @@ def bounded_memory_maps() -> None:
 
 @pytest.fixture(scope="session", autouse=True)
 def cache(tmp_path_factory) -> Iterator[None]:
-    """Nothing of the user's cache is read or written."""
+    """Nothing of the user's cache and weights is read or written."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("MFVPR_CACHE", str(tmp_path_factory.mktemp("cache")))
+        patch.setenv("MFVPR_WEIGHTS", str(tmp_path_factory.mktemp("none")))
         yield
 
 

@@ -8,11 +8,14 @@ from pathlib import Path
 
 import pytest
 
+from mfvpr.checkpoints import entry_of, is_installed, weights_folder
+
 ROOT = Path(__file__).parent.parent
 SHARED = ROOT.parent / "shared"
 PHOTOGRAPHS, ALIKED = SHARED / "data", SHARED / "weights" / "aliked"
 LIGHTGLUE = SHARED / "weights" / "lightglue" / "aliked_lightglue.pth"
 PROGRAMS = ("c++", "chromium", "cmake", "unshare")
+WEIGHTS = weights_folder()  # of the user, whose weights other tests do not see
 OF_A_CLONE = ("experiments", "notebooks")  # packages that the wheel does not hold
 
 _lists = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["optional-dependencies"]
@@ -47,3 +50,10 @@ def skip_without(*names: str | Path) -> None:
     for name in names:
         if not is_at_hand(name):
             pytest.skip(reason(name))
+
+
+def use_weights(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Load the user's weights from now on; skip if those of a network are not installed."""
+    monkeypatch.setenv("MFVPR_WEIGHTS", str(WEIGHTS))
+    if not is_installed(entry_of(name)):
+        pytest.skip(f"needs weights: mfvpr weights download {name}")

@@ -1,60 +1,76 @@
 """Milliseconds from an image file to its prediction, in maps of 1,000 and 10,000 images."""
 
 import tempfile
+import time
+from collections.abc import Callable
 from functools import partial
 from pathlib import Path
-from typing import Any
 
-import jax
 import numpy as np
 
-from experiments.benchmark.harness import Rows, duration
-from mfvpr.checkpoints import REGISTRY, is_installed, load_model
-from mfvpr.core import HistogramOfShifts
-from mfvpr.datasets import ImageFolder, image_folder, read_image, resize
+import mfvpr
+from experiments.benchmark.harness import Rows
+from mfvpr.datasets import image_folder, read_image
 from mfvpr.datasets.streets import streets_folder
-from mfvpr.evaluation import Pipeline, System
-from mfvpr.features import Aggregated, AlikedFeatures, Sift, VladFitting
 from mfvpr.localization import Map
-from mfvpr.retrieval import Retrieval
 from mfvpr.storage import FeatureCache
 
-SIZES, CANDIDATES = (1000, 10_000), 50
-FRAMES = 100  # of the synthetic street; a map holds each of them again and again
+SIZES = 1000, 10_000
+FRAMES, IMAGE_SIZE = 100, (1024, 384)  # of the synthetic street; a map holds each of them again and again
+SYSTEMS = {
+    "steering features=sift": partial(mfvpr.load_system, "steering", features="sift"),
+    "mfvpr": partial(mfvpr.load_system, "mfvpr"),
+    "fast": partial(mfvpr.load_system, "fast"),
+}
 
 
 def measure_maps(rounds: int) -> Rows:
-    """Rows of maps; each query is localized once with candidates on disk, then in rounds with candidates in memory."""
-    extractors: dict[str, Any] = {"SIFT": Sift()}
-    if is_installed(REGISTRY["aliked-n16"]):
-        model: Any = load_model("aliked-n16")
-        extractors["ALIKED n16"] = AlikedFeatures(model)
+    """Rows of the systems whose weights are installed, and of map sizes."""
     rows: Rows = []
     with tempfile.TemporaryDirectory(prefix="mfvpr-localize-") as folder:
         root = Path(folder)
-        street, cache = streets_folder(root, num_frames=FRAMES), FeatureCache(root / "cache")
-        frames, queries = image_folder(street / "database").paths, image_folder(street / "queries")
+        street, cache = streets_folder(root, num_frames=FRAMES, image_size=IMAGE_SIZE), FeatureCache(root / "cache")
+        frames, queries = image_folder(street / "database").paths, image_folder(street / "queries").paths
         for size in SIZES:
             images = root / f"images-{size}"
             images.mkdir()
             for number in range(size):
                 (images / f"{number:05d}.png").symlink_to(frames[number % FRAMES])
-            for name, extractor in extractors.items():
-                pipeline = Pipeline(extractor, Retrieval(Aggregated(extractor, VladFitting())), candidates=CANDIDATES)
-                system = System(pipeline, {"histogram": HistogramOfShifts()})
-                street_map = Map.create(root / f"{name}-{size}", images, system, cache=cache)
-                rows.append({"features": name, "images": size} | _milliseconds(street_map, queries, rounds))
+            for name, load in SYSTEMS.items():
+                try:
+                    known = Map.create(root / f"{name}-{size}", images, load(), cache=cache)
+                except mfvpr.InputError as error:
+                    print(f"{name}: {error}")
+                    continue
+                rows.append({"system": name, "images": size} | _milliseconds(known, queries, rounds))
     return rows
 
 
-def _milliseconds(street_map: Map, queries: ImageFolder, rounds: int) -> dict[str, float]:
-    """With candidates in memory, with candidates that are read from disk, and of the features alone."""
-    extractor = street_map.extractor
-    street_map.localize(queries.paths[0])
-    cold = [duration(partial(street_map.localize, path)) for path in queries.paths[1:]]
-    warm = [duration(partial(street_map.localize, path)) for _ in range(rounds) for path in queries.paths]
-    pixels = [resize(read_image(path), extractor.image_size, extractor.interpolation) for path in queries.paths[:20]]
-    features = [duration(lambda image=image: jax.block_until_ready(extractor(image[None]))) for image in pixels]
-    columns = {"p50, ms": (warm, 50), "p95, ms": (warm, 95), "p50, candidates read": (cold, 50), "p95": (cold, 95)}
-    columns["features alone"] = features, 50
-    return {name: 1e3 * float(np.percentile(seconds, share)) for name, (seconds, share) in columns.items()}
+def _milliseconds(known: Map, paths: list[Path], rounds: int) -> dict[str, float]:
+    """Wall and CPU time with candidates that are read from disk and in memory, and the time of the first two steps."""
+    known.warm_up()
+    first = _times(known.localize, paths)
+    again = np.concatenate([_times(known.localize, paths) for _ in range(rounds)])
+    pixels = [read_image(path) for path in paths]
+    p50, p95 = np.percentile(again, [50, 95], axis=0)
+    decoding, describing = (
+        np.median(times[:, 0]) for times in (_times(read_image, paths), _times(known.describing.image, pixels))
+    )
+    return {
+        "p50, ms": p50[0],
+        "p95, ms": p95[0],
+        "CPU, ms": p50[1],
+        "p50, candidates read": float(np.median(first[:, 0])),
+        "decoding": float(decoding),
+        "features and descriptors": float(describing),
+    }
+
+
+def _times(function: Callable[..., object], inputs: list) -> np.ndarray:
+    """Milliseconds of wall and CPU time of each call."""
+    times = []
+    for each in inputs:
+        wall, cpu = time.perf_counter(), time.process_time()
+        function(each)
+        times.append((1e3 * (time.perf_counter() - wall), 1e3 * (time.process_time() - cpu)))
+    return np.array(times)

@@ -5,15 +5,13 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import yaml
-
 from mfvpr.checkpoints import REGISTRY, is_installed
 from mfvpr.checkpoints.networks import Entry
 from mfvpr.cli.command_line import override
 from mfvpr.cli.schema import DATA_SET_NAME, Evaluate
 from mfvpr.datasets.published import PUBLISHED
 from mfvpr.utils.errors import InputError
-from mfvpr.utils.files import expand_user
+from mfvpr.utils.files import expand_user, read_yaml
 
 DRAWN = "streets_seasons"
 REAL = {"grief_season": ("database", "queries"), "corridor": ("ref", "query")}  # data sets, and their folders
@@ -47,7 +45,7 @@ class Place:
     settings: tuple[str, ...]
 
 
-_SYSTEMS: Mapping[str, Any] = yaml.safe_load((Path(__file__).parent / "systems.yaml").read_text(encoding="utf-8"))
+_SYSTEMS: Mapping[str, Any] = read_yaml(Path(__file__).with_name("systems.yaml"))
 ROWS = tuple(Row(name, **{"run": name, **values}) for name, values in _SYSTEMS["rows"].items())
 
 

@@ -7,7 +7,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import yaml
 from jaxtyping import Float
 
 from experiments.paper.systems import Row
@@ -16,6 +15,7 @@ from mfvpr.datasets.datasets import MEANS
 from mfvpr.datasets.ground_truth import middle
 from mfvpr.datasets.published import published_differences
 from mfvpr.report import Table
+from mfvpr.utils.files import read_yaml
 
 BERLIN = ("berlin_a100", "berlin_kudamm", "berlin_halenseestrasse")
 SEPARATE = ("gardens_point", "nordland_1415", "robotcar_seasons")
@@ -62,7 +62,7 @@ class Evaluations:
 @cache
 def printed_tables() -> Mapping[str, Any]:
     """Tables by their names in printed.yaml, which describes them."""
-    return yaml.safe_load((Path(__file__).parent / "printed.yaml").read_text(encoding="utf-8"))
+    return read_yaml(Path(__file__).with_name("printed.yaml"))
 
 
 def average(recalls: Mapping[str, Any]) -> Float[np.ndarray, " tolerances"]:

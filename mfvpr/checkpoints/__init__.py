@@ -1,7 +1,7 @@
 """Published network weights: their sources, their conversion to runtime files, and networks with these weights.
 
-Read first: networks (published files and the network of each), files (install, save, load), conversion (tables of
-keys), checkpoint (readers).
+Read first: published.yaml (files, sources and the network of each), networks (their entries), files (install, save,
+load), keys.yaml and conversion (keys of checkpoints), checkpoint (readers).
 """
 
 import lazy_loader

@@ -10,8 +10,8 @@ from typing import Any, BinaryIO, ClassVar
 
 import numpy as np
 
-from mfvpr.io.containers import reading, shorten
-from mfvpr.io.object_files import NUMPY_MAGIC, DataUnpickler, open_torch_archive, read_matlab, read_objects
+from mfvpr.io.containers import read_npy_header, reading, shorten
+from mfvpr.io.object_files import ArrayUnpickler, DataUnpickler, open_torch_archive, read_matlab
 from mfvpr.utils.errors import InputError
 
 
@@ -49,7 +49,12 @@ def _require_tensors(content: Any) -> dict[str, np.ndarray]:
 
 def _read_layers(file: BinaryIO) -> dict[str, np.ndarray]:
     """Read a .npy file with a pickled dictionary of layers."""
-    [layers] = read_objects(file, "a dictionary of layers")
+    shape, _, dtype = read_npy_header(file)
+    content = ArrayUnpickler(file).load() if dtype.hasobject else None
+    if not isinstance(content, np.ndarray) or content.dtype != object or content.shape != shape:
+        got = f"another object of {dtype} {[*shape]}"
+        raise InputError(f"expected a dictionary of layers, got {got}; use the official file")
+    [layers] = content.ravel().tolist()
     return {f"{layer}.{name}": array for layer, parts in layers.items() for name, array in parts.items()}
 
 
@@ -132,4 +137,4 @@ def _tensors(content: Any, storages: Mapping[str, np.ndarray], order: str, read_
 
 
 # First bytes of a file -> reader; every binary pickle begins with the last ones.
-_READERS = {b"PK": _read_zip, NUMPY_MAGIC: _read_layers, b"MATLAB": read_matlab, b"\x80": _read_legacy}
+_READERS = {b"PK": _read_zip, b"\x93NUMPY": _read_layers, b"MATLAB": read_matlab, b"\x80": _read_legacy}

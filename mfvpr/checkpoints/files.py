@@ -13,7 +13,15 @@ import safetensors.numpy
 
 from mfvpr.checkpoints.checkpoint import read_checkpoint
 from mfvpr.checkpoints.conversion import RUNTIME, convert
-from mfvpr.checkpoints.networks import CUSTOM_PREFIX, Entry, custom_entry, entry_of, how_to_install, plan_network
+from mfvpr.checkpoints.networks import (
+    CUSTOM_PREFIX,
+    RECOMMENDED,
+    Entry,
+    custom_entry,
+    entry_of,
+    how_to_install,
+    plan_network,
+)
 from mfvpr.io.containers import reading
 from mfvpr.utils.errors import InputError
 from mfvpr.utils.files import replacing, require_file
@@ -125,6 +133,8 @@ def read_provenance(name: str) -> dict[str, Any]:
     entry = installed_entry(name)
     if not is_installed(entry):
         source, command = f"{entry.file} from {entry.source} ({entry.license})", how_to_install(entry)
+        if entry.name in RECOMMENDED:
+            command += ", or with all that system=mfvpr and system=fast need: mfvpr weights download recommended"
         raise WeightsError(f"{name}: not installed in {weights_folder()}; get {source} and install it: {command}")
     with suppress(safetensors.SafetensorError, ValueError):
         provenance = _read(_path(entry), with_arrays=False)[0]

@@ -23,6 +23,7 @@ from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 from mfvpr.checkpoints import entry_of, is_installed
+from mfvpr.checkpoints.networks import RECOMMENDED
 from mfvpr.cli import schema
 from mfvpr.cli.console import explain, one_line, tell, warn
 from mfvpr.evaluation import System
@@ -34,6 +35,8 @@ from mfvpr.utils.errors import InputError
 from mfvpr.utils.fields import from_values
 
 Job = Callable[[Any], None]  # of the settings of its program
+# Without any of these arguments, `system=auto` chooses.
+_CHOICES = r"[~+]*(system|experiment|features|retrieval|matching|scorer)[=.@]|(?!-m$|--multirun$)-"
 
 
 def run(program: str, find_job: Callable[[], Job]) -> None:
@@ -41,7 +44,11 @@ def run(program: str, find_job: Callable[[], Job]) -> None:
     os.environ["HYDRA_FULL_ERROR"] = "1"  # Hydra then raises its errors
     warnings.filterwarnings("ignore", "A worker stopped")  # joblib renews a worker that has grown
     schema.register()
-    sys.argv[1:] = itertools.chain.from_iterable(map(alternate, sys.argv[1:]))
+    typed = sys.argv[1:]
+    if program in ("evaluate", "map") and not any(re.match(_CHOICES, each) for each in typed):
+        typed = ["system=auto", *typed]
+    is_auto = "system=auto" in typed
+    sys.argv[1:] = itertools.chain.from_iterable(map(translate, typed))
 
     def task(composed: DictConfig) -> None:
         about, typed, multirun = HydraConfig.get(), sys.argv[1:], None
@@ -52,6 +59,8 @@ def run(program: str, find_job: Callable[[], Job]) -> None:
             tell(f"job {about.job.num}: {' '.join(typed)}")
         with one_line() if multirun is None else nullcontext():  # in here, or Hydra adds lines to the error
             settings, job = checked(program, composed), find_job()
+            if is_auto:
+                tell(installed_system()[1])
             _set_up_jax(settings.compiled)
             if not isinstance(settings, schema.Common):
                 job(settings)
@@ -67,12 +76,25 @@ def run(program: str, find_job: Callable[[], Job]) -> None:
     hydra.main(version_base="1.3", config_path=str(CONF), config_name=program)(task)()
 
 
-def alternate(override: str) -> list[str]:
-    """`retrieval=[A,B]` in the words of Hydra, which would merge the choices of a list; others as they are."""
+def translate(override: str) -> list[str]:
+    """`system=auto` and `retrieval=[A,B]` in Hydra's words, which would merge the choices of a list; others as is."""
+    if override == "system=auto":
+        return installed_system()[0]
     if (listed := re.fullmatch(r"retrieval=\[(.*)\]", override)) is None:
         return [override]
     names = [name.strip() for name in listed[1].split(",")]
     return ["~retrieval", *(f"+retrieval@retrieval.{name}={name}" for name in names)]
+
+
+def installed_system() -> tuple[list[str], str]:
+    """`system=auto`: the best recommended system whose weights are installed, or none; and a line that says which."""
+    missing = {name for name in RECOMMENDED if not is_installed(entry_of(name))}
+    for system, needed in (("mfvpr", {"aliked-n16", "efficientnet_lite0"}), ("fast", {"xfeat", "efficientnet_lite0"})):
+        if not needed & missing:
+            about = "whose weights are installed; choose another with system=NAME"
+            return [f"system={system}"], f"system=auto: {system}, {about}"
+    better = "better with weights: mfvpr weights download recommended"
+    return [], f"system=auto: SIFT and VLAD, which need no weights; {better}"
 
 
 def _set_up_jax(compiled: bool) -> None:
@@ -138,7 +160,8 @@ def load_system(name: str | Path = "mfvpr", **settings: Any) -> System:
             says what was expected.
     """
     if not str(name).endswith(".json"):
-        composed = compose("evaluate", [*_overrides({"system": str(name)} | settings)])
+        overrides = installed_system()[0] if name == "auto" else [override("system", name)]
+        composed = compose("evaluate", [*overrides, *_overrides(settings)])
         values: Any = OmegaConf.to_container(composed, resolve=True)
         chosen = from_values(schema.Evaluate, values)
     elif settings:
@@ -159,7 +182,7 @@ def _overrides(settings: Mapping[str, Any], prefix: str = "") -> Iterator[str]:
     """Settings in Hydra's grammar."""
     for name, value in settings.items():
         if f"{prefix}{name}" == "retrieval" and isinstance(value, list | tuple):
-            yield from alternate(f"retrieval=[{','.join(value)}]")
+            yield from translate(f"retrieval=[{','.join(value)}]")
         elif f"{prefix}{name}" == "fusion.weights" and isinstance(value, Mapping):  # any names, no settings
             yield f"fusion.weights={{{','.join(f'{scorer}:{weight}' for scorer, weight in value.items())}}}"
         elif isinstance(value, Mapping):

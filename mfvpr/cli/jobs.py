@@ -12,7 +12,7 @@ from mfvpr.baselines.learned_weight import provenance
 from mfvpr.cli.console import tell, track, warn
 from mfvpr.cli.schema import Common, RecallSettings
 from mfvpr.core.types import Shortlist
-from mfvpr.datasets import Dataset, IndexFile, LabelFiles
+from mfvpr.datasets import Dataset, FrameTruth, IndexFile, LabelFiles
 from mfvpr.datasets.contents import Contents, fingerprints, identical_rows
 from mfvpr.datasets.ground_truth import CHOICES, threshold_words
 from mfvpr.datasets.published import published_dataset, published_differences
@@ -140,6 +140,7 @@ def dataset_of(settings: Mapping[str, Any]) -> Dataset:
         truth = LabelFiles(expand_user(settings["query_labels"]), expand_user(settings["database_labels"]))
     paths = [expand_user(path) for path in settings["queries"]] if several else expand_user(settings["queries"])
     options = {name: settings[name] for name in ("name", "orient", "bits")}
+    options |= {name: expand_user(settings[name]) for name in ("masks", "among") if settings.get(name)}
     return datasets.folder(expand_user(settings["database"]), paths, ground_truth=truth, **options)
 
 
@@ -180,8 +181,8 @@ def _warn_of_data(dataset: Dataset, contents: Mapping[str, Contents], thresholds
     for difference in published_differences(dataset):
         warn(f"{dataset.name}: {difference}; its numbers are not comparable")
     for sequence, images in zip(dataset.sequences, [*contents.values()][1:], strict=True):
-        same = sum(map(bool, identical_rows(images, contents["database"])))
-        if same and sequence.excluded is None:
+        same = FrameTruth(identical_rows(images, contents["database"]), len(dataset.database)).positives(0)
+        if same := ((same if sequence.excluded is None else same - sequence.excluded).counts > 0).sum():
             images_of = f"{same} of {len(sequence.images)} queries are database images"
             warn(f"{images_of}: each finds itself; set dataset.exclude_neighbors=N, the frames to leave out around it")
         if (truth := sequence.truth) is None:

@@ -260,6 +260,8 @@ class _Images(_Published):
     )
     index_file: str | None = setting(None, PATH | None, "for index: .csv, .npz or .json")
     widen_index: bool = setting(False, FLAG, "for index: images within recall.tolerances count as well")
+    masks: str | None = setting(None, PATH | None, "folder of masks by image name, or one mask; black is ignored")
+    among: str | None = setting(None, PATH | None, "file of pairs, as for index: the only candidates of each query")
     exclude_neighbors: int | None = setting(None, INDEX | None, "frames around a query itself to leave out; 0 = itself")
     orient: bool = setting(True, FLAG, "turn images as their EXIF orientation says")
     bits: int | None = setting(16, whole(8, 16) | None, "that 16-bit images use, of which the upper 8 are taken")

@@ -9,7 +9,7 @@ import json
 import os
 import time
 from collections import defaultdict
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from contextlib import suppress
 from dataclasses import astuple, dataclass
 from functools import cached_property
@@ -39,24 +39,27 @@ class Contents:
 
     folder: ImageFolder
     files: tuple[Content, ...]
+    masks: tuple[Content, ...] = ()  # of each image, if the folder has masks
 
     @cached_property
     def fingerprint(self) -> str:
-        """SHA-256 over names, contents and conversions; the first 16 hexadecimal digits."""
+        """SHA-256 over names, contents, masks and conversions; the first 16 hexadecimal digits."""
         digest = hashlib.sha256()
-        for name, file in zip(self.folder.names, self.files, strict=True):
-            digest.update(name.encode("utf-8", "surrogateescape") + b"\0" + self._pixels(file))
+        for name, pixels in zip(self.folder.names, self._pixels(), strict=True):
+            digest.update(name.encode("utf-8", "surrogateescape") + b"\0" + pixels)
         return digest.hexdigest()[:16]
 
     @property
     def keys(self) -> list[str]:
-        """SHA-256 of each image's content and conversions; the first 32 hexadecimal digits."""
-        return [hashlib.sha256(self._pixels(file)).hexdigest()[:32] for file in self.files]
+        """SHA-256 of each image's content, mask and conversions; the first 32 hexadecimal digits."""
+        return [hashlib.sha256(pixels).hexdigest()[:32] for pixels in self._pixels()]
 
-    def _pixels(self, file: Content) -> bytes:
-        content = bytes.fromhex(file.sha256) if file.sha256 else b"unreadable"
+    def _pixels(self) -> Iterator[bytes]:
         ways = self.folder.orient, self.folder.bits
-        return content if ways == (True, 16) else content + f"\0{ways}".encode()
+        conversion = b"" if ways == (True, 16) else f"\0{ways}".encode()
+        for row, file in enumerate(self.files):
+            content = bytes.fromhex(file.sha256) if file.sha256 else b"unreadable"
+            yield content + conversion + (f"\0{self.masks[row].sha256}".encode() if self.masks else b"")
 
     @cached_property
     def sha256(self) -> str:
@@ -86,7 +89,8 @@ def contents(folder: ImageFolder, cache: Path | str | None = None) -> Contents:
         records |= {name: [*state, *astuple(files[name])] for name, state in settled.items()}
         with suppress(OSError):  # records only save time
             write_text(path, json.dumps(records, separators=(",", ":")))  # ASCII: file names may be no UTF-8
-    return Contents(folder, tuple(files[name] for name in folder.names))
+    masks = () if folder.mask_files is None else contents(folder.mask_files, cache).files
+    return Contents(folder, tuple(files[name] for name in folder.names), masks)
 
 
 def fingerprints(contents: Mapping[str, Contents]) -> dict[str, str]:

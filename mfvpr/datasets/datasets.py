@@ -3,11 +3,9 @@
 import os
 import re
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
-from pathlib import Path
-
-import numpy as np
-from jaxtyping import UInt8
+from dataclasses import dataclass, field, replace
+from functools import partial
+from pathlib import Path, PurePosixPath
 
 from mfvpr.datasets.ground_truth import (
     CHOICES,
@@ -18,8 +16,9 @@ from mfvpr.datasets.ground_truth import (
     truth_from_labels,
     truth_from_names,
 )
-from mfvpr.datasets.image_reading import read_image
+from mfvpr.datasets.image_reading import Ignored, Pixels, fill_ignored, read_image
 from mfvpr.datasets.positives import Positives
+from mfvpr.io.containers import require_all
 from mfvpr.utils.errors import InputError
 from mfvpr.utils.files import IMAGE_SUFFIXES
 from mfvpr.utils.fingerprints import fingerprint, recipe_of
@@ -67,9 +66,12 @@ class ImageFolder:
     names: tuple[str, ...]  # relative POSIX paths in natural order (image2 before image10)
     orient: bool = True  # see `mfvpr.datasets.image_reading.read_image`
     bits: int | None = 16
+    masks: Path | None = None  # see `image_folder`
+    mask_files: "ImageFolder | None" = field(init=False, compare=False)  # the mask of each image
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "root", Path(self.root))
+        object.__setattr__(self, "mask_files", None if self.masks is None else _mask_files(self, Path(self.masks)))
 
     def __repr__(self) -> str:
         return f"ImageFolder({self.root}: {len(self)} images)"
@@ -82,9 +84,14 @@ class ImageFolder:
     def __len__(self) -> int:
         return len(self.names)
 
-    def read(self, row: int) -> UInt8[np.ndarray, "height width 3"]:
-        """Read one image; errors are those of `read_image`."""
-        return read_image(self.root / self.names[row], orient=self.orient, bits=self.bits)
+    def read(self, row: int) -> Pixels:
+        """Read one image, filled where its mask ignores pixels; errors are those of `read_image`, `fill_ignored`."""
+        return self.read_with_ignored(row)[0]
+
+    def read_with_ignored(self, row: int) -> tuple[Pixels, Ignored | None]:
+        """Read one image as `read` does, and which pixels its mask ignores; None without masks."""
+        image, masks = read_image(self.root / self.names[row], orient=self.orient, bits=self.bits), self.mask_files
+        return (image, None) if masks is None else fill_ignored(image, masks.root / masks.names[row])
 
 
 @dataclass(frozen=True, repr=False)
@@ -115,7 +122,7 @@ class QuerySequence:
             raise InputError(f"exclude_neighbors={neighbors}: expected queries among the database images, got {got}")
         excluded = FrameTruth(query_rows, num_database).positives(neighbors)
         truth = None if self.truth is None else AllowedTruth(self.truth, excluded)
-        return replace(self, truth=truth, excluded=excluded)
+        return replace(self, truth=truth, excluded=excluded if self.excluded is None else self.excluded | excluded)
 
 
 @dataclass(frozen=True, repr=False)
@@ -162,12 +169,18 @@ class Dataset:
         return fingerprint(recipe_of(content)) if content else None
 
 
-def image_folder(root: Path | str, *, orient: bool = True, bits: int | None = 16) -> ImageFolder:
+def image_folder(
+    root: Path | str, *, orient: bool = True, bits: int | None = 16, masks: Path | str | None = None
+) -> ImageFolder:
     """All images below `root`, in subfolders and linked folders as well; hidden files and folders are skipped.
 
         mfvpr.datasets.image_folder("day/").read(0)  # [H, W, 3] uint8 RGB; for orient and bits see `read_image`
 
-    An `InputError` for a folder that is missing, empty or unreadable, a broken link, or a link to a parent folder.
+    `masks` are images that are black where pixels are ignored: one file for all images, or a folder. There, the mask of
+    `a.jpg` is `a.jpg`, `a.png` (any suffix) or `a.jpg.png`, in a subfolder with the name of `root` if there is one.
+
+    An `InputError` for a folder that is missing, empty or unreadable, a broken link, a link to a parent folder, or an
+    image without a mask.
     """
     root, names = Path(root), []
     if not root.is_dir():
@@ -196,7 +209,18 @@ def image_folder(root: Path | str, *, orient: bool = True, bits: int | None = 16
         parts = [part.lstrip("0") if part.isdecimal() else part for part in re.split(r"(\d+)", name)]
         return [(place % 2 and len(part), part) for place, part in enumerate(parts)], name
 
-    return ImageFolder(root, tuple(sorted(names, key=natural)), orient, bits)
+    return ImageFolder(root, tuple(sorted(names, key=natural)), orient, bits, None if masks is None else Path(masks))
+
+
+def _mask_files(images: ImageFolder, masks: Path) -> ImageFolder:
+    if masks.is_file():
+        return ImageFolder(masks.parent, (masks.name,) * len(images))
+    subfolder = masks / images.root.resolve().name
+    files = image_folder(subfolder if subfolder.is_dir() else masks)
+    stem = lambda name: str(PurePosixPath(name).with_suffix(""))  # noqa: E731
+    mask_of = {stem(name): name for name in files.names} | {name: name for name in files.names}
+    names = [mask_of.get(name, mask_of.get(stem(name))) for name in images.names]
+    return replace(files, names=tuple(require_all(files.root, images.names, names, "masks (white ignores nothing)")))
 
 
 def folder(
@@ -207,6 +231,8 @@ def folder(
     name: str = "folder",
     orient: bool = True,
     bits: int | None = 16,
+    masks: Path | str | None = None,
+    among: Path | str | None = None,
 ) -> Dataset:
     """Folders of images as a data set: one of database images, and one or several of queries.
 
@@ -220,23 +246,30 @@ def folder(
             "none" or None = rankings only; or files; or a ground truth of your own.
         name: in results.
         orient, bits: see `mfvpr.datasets.image_reading.read_image`.
+        masks: of pixels to ignore, see `image_folder`.
+        among: file of pairs as of `IndexFile`, of each query and the only database images that may be its candidates.
     """
-    images = image_folder(database, orient=orient, bits=bits)
+    images = image_folder(database, orient=orient, bits=bits, masks=masks)
+    sequence = partial(_sequence, images, ground_truth, among)
     if isinstance(queries, Path | str):
-        return Dataset(name, images, (_sequence(name, images, queries, ground_truth, Path()),))
+        return Dataset(name, images, (sequence(name, queries, Path()),))
     folders = [Path(path) for path in queries]
     names = [(path.resolve() if path.name in ("", "..") else path).name for path in folders]
     if not names or len({*names, *MEANS}) < len(names) + len(MEANS):
         got = ", ".join(names) or "none"
         raise InputError(f"queries: expected folders of different names, none called {' or '.join(MEANS)}, got {got}")
-    sequences = [_sequence(part, images, path, ground_truth, path) for part, path in zip(names, folders, strict=True)]
-    return Dataset(name, images, tuple(sequences))
+    return Dataset(name, images, tuple(map(sequence, names, folders, folders)))
 
 
 def _sequence(
-    name: str, database: ImageFolder, queries: Path | str, ground_truth: GroundTruth | str | None, root: Path
+    database: ImageFolder,
+    ground_truth: GroundTruth | str | None,
+    among: Path | str | None,
+    name: str,
+    queries: Path | str,
+    root: Path,
 ) -> QuerySequence:
-    images = image_folder(queries, orient=database.orient, bits=database.bits)
+    images = image_folder(queries, orient=database.orient, bits=database.bits, masks=database.masks)
     names = images.names, database.names
     match ground_truth:
         case None | "none":
@@ -257,4 +290,9 @@ def _sequence(
         case _:
             files = "files are given as mfvpr.datasets.IndexFile(FILE) or LabelFiles(QUERIES, DATABASE)"
             raise InputError(f"ground_truth={ground_truth}: expected one of {CHOICES}; {files}")
-    return QuerySequence(name, images, truth)
+    if among is None:
+        return QuerySequence(name, images, truth)
+    allowed = truth_from_file(root / among, *names)
+    if not isinstance(allowed, FrameTruth):
+        raise InputError(f"{root / among}: expected pairs of images, got positions; list the candidates of each query")
+    return QuerySequence(name, images, truth, Positives(~allowed.positives(0).dense()))

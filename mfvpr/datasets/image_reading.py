@@ -14,7 +14,7 @@ from typing import BinaryIO, Literal
 
 import cv2
 import numpy as np
-from jaxtyping import Num, UInt8
+from jaxtyping import Bool, Num, UInt8
 from PIL import Image, ImageFile
 
 from mfvpr.io.containers import reading
@@ -28,6 +28,8 @@ VIDEO_SUFFIXES = frozenset({".avi", ".m4v", ".mkv", ".mov", ".mp4", ".webm"})
 Interpolation = Literal[
     "pil_bilinear", "pil_bicubic", "cv2_linear", "cv2_area", "cv2_cubic", "torch_bilinear", "torch_no_antialias"
 ]
+Pixels = UInt8[np.ndarray, "height width 3"]
+Ignored = Bool[np.ndarray, "height width"]
 _PIL = {"pil_bilinear": Image.Resampling.BILINEAR, "pil_bicubic": Image.Resampling.BICUBIC}
 _CV2 = {"cv2_linear": cv2.INTER_LINEAR, "cv2_area": cv2.INTER_AREA, "cv2_cubic": cv2.INTER_CUBIC}
 _GRAY, _COLOR = ("I", "I;16", "I;16L", "I;16B", "I;16N"), ("RGB", "RGBA", "LA")  # Pillow's modes of 16-bit files
@@ -41,7 +43,7 @@ warnings.filterwarnings("ignore", category=Image.DecompressionBombWarning)
 warnings.filterwarnings("ignore", message="Palette images with Transparency")
 
 
-def read_image(path: Path | str, *, orient: bool = True, bits: int | None = 16) -> UInt8[np.ndarray, "height width 3"]:
+def read_image(path: Path | str, *, orient: bool = True, bits: int | None = 16) -> Pixels:
     """Read the image file `path` as RGB.
 
         image = mfvpr.datasets.read_image("query.jpg")  # [H, W, 3] uint8
@@ -78,6 +80,21 @@ def read_image(path: Path | str, *, orient: bool = True, bits: int | None = 16) 
             return np.asarray(rgb)
         turn = _INVERSE.get(orientation, orientation) if is_turned else orientation
         return np.asarray(rgb.transpose(_TURN[turn]) if turn in _TURN else rgb)
+
+
+def fill_ignored(image: Pixels, mask: Path) -> tuple[Pixels, Ignored]:
+    """Fill pixels that a mask ignores with the mean color of the other pixels; also return which pixels these are.
+
+    A mask is an image file of any size, black (below 128) where pixels are ignored. Errors are those of `read_image`;
+    also an `InputError` if the mask ignores the whole image.
+    """
+    brightness = Image.fromarray(read_image(mask)).convert("L")
+    ignored = np.asarray(brightness.resize(image.shape[1::-1], Image.Resampling.NEAREST)) < 128
+    if ignored.all():
+        expected = "a mask with pixels of 128 or more, which are used"
+        raise InputError(f"{mask}: expected {expected}, got one that ignores the whole image; write them as 255")
+    mean = np.rint(image[~ignored].mean(axis=0)).astype(np.uint8)
+    return np.where(ignored[..., None], mean, image), ignored
 
 
 def read_size(path: Path | str, *, orient: bool = True) -> tuple[int, int]:

@@ -16,30 +16,12 @@ from mfvpr.datasets.ground_truth import FrameTruth, RadiusTruth, Truth, truth_fr
 from mfvpr.datasets.positives import FARTHEST, positives_within, require_positions
 from mfvpr.io.containers import parse_number, reading
 from mfvpr.utils.errors import InputError
+from mfvpr.utils.files import read_yaml
 
 SEASONS = ("fall", "spring", "summer", "winter")
 REFERENCE = "overcast-summer"  # the paper's figure; its text says overcast-reference, whose images are 6,954
 CONDITIONS = ("dawn", "dusk", "night", "night-rain", "overcast-winter", "rain", "snow")
 CITIES = ("cph", "sf")
-
-SSM_LAYOUT = """Reference/image0000.png (or .jpg), ...  the database, numbered from 0
-Live/image0000.png (or .jpg), ...       the queries, numbered from 0
-GroundTruth.csv                         Reference,Live and then a line per query: both numbers"""
-LAYOUT_27592 = """summer/images-00202.png, ...  the database (or another of dataset.seasons)
-winter/images-00202.png, ...  the queries: the same names
-nordland_imageNames_index.txt, nordland_imageNames_query.txt  Patch-NetVLAD's lists, where the folders hold more"""
-LAYOUT_3450 = """summer_images_test/section1/*.png, section2/*.png  the database (or another of dataset.seasons)
-winter_images_test/section1/*.png, section2/*.png  the queries: the same names"""
-LAYOUT_VPRBENCH = """ref/0000000.jpg, ...    the database, in winter
-query/0000000.jpg, ...  the queries, in summer: query i shows database image 10 i"""
-ROBOTCAR_LAYOUT = f"""images/CONDITION/rear/TIMESTAMP.jpg  of {REFERENCE} (the database),
-                                     {", ".join(CONDITIONS)}
-robotcar_v2_train.txt                per line CONDITION/rear/TIMESTAMP.jpg and 16 numbers, camera to world"""
-PITTSBURGH_LAYOUT = """000/*.jpg, ..., queries_real/000/*.jpg, ...
-datasets/pitts30k_{part}.mat                   lists and positions"""
-MSLS_LAYOUT = """train_val/cph/database/images/*.jpg, raw.csv, postprocessed.csv, subtask_index.csv
-train_val/cph/query, train_val/sf/database, train_val/sf/query  the same"""
-
 
 Content = tuple[ImageFolder, ImageFolder, Truth]  # database, queries and ground truth of one sequence
 
@@ -241,40 +223,33 @@ def listed_images(root: Path, names: Sequence[str], origin: Path) -> ImageFolder
     return ImageFolder(root, tuple(names))
 
 
-_SSM_VPR, _SEASONS = "http://imr.ciirc.cvut.cz/Datasets/Ssm-vpr", ("summer", "winter")
-_ENTRIES = (
-    *(
-        Published(name, f"{title}, as SSM-VPR has it", SSM_LAYOUT, database, {name: queries}, ssm_vpr, _SSM_VPR,
-                  (name, archive))
-        for name, title, database, queries, archive in (
-            ("berlin_a100", "Berlin A100: a motorway from two cars", 85, 81, "BerlinA100_RAS2020"),
-            ("berlin_halenseestrasse", "Berlin Halenseestrasse: a road and its bicycle lane", 67, 157,
-             "Halen_RAS2020"),
-            ("berlin_kudamm", "Berlin Kudamm: a busy street from a bus and a bicycle", 201, 222, "Kudamm_RAS2020"),
-            ("gardens_point", "Gardens Point: a campus by day and at night", 200, 200, "Gardens_point_RAS2020"),
-            ("nordland_1415", "Synthesized Nordland, 1415 frames", 1415, 1415, "Nordland_RAS2020"),
+_READERS = {
+    "ssm_vpr": ssm_vpr,
+    "nordland_27592": nordland_27592,
+    "nordland_3450": nordland_3450,
+    "nordland_vprbench": nordland_vprbench,
+    "robotcar_seasons": robotcar_seasons,
+    "pitts30k_val": partial(pitts30k, name="pitts30k_val"),
+    "pitts30k_test": partial(pitts30k, name="pitts30k_test"),
+    "msls_val": msls_val,
+}
+
+
+def _published() -> Iterator[Published]:
+    """The entries of published.yaml, which says what its values are."""
+    for name, about in read_yaml(Path(__file__).with_name("published.yaml")).items():
+        queries, seasons = about["queries"], about.get("seasons")
+        yield Published(
+            name,
+            about["title"],
+            about["layout"],
+            about["database"],
+            queries if isinstance(queries, dict) else {name: queries},
+            _READERS[about["read"]],
+            about["source"],
+            (name, about["archive"]) if "archive" in about else (name,),
+            seasons and tuple(seasons),
         )
-    ),
-    Published("nordland_27592", "Nordland, every frame but tunnels and stations (Patch-NetVLAD's)", LAYOUT_27592,
-              27_592, {"nordland_27592": 27_592}, nordland_27592, "https://github.com/QVPR/Patch-NetVLAD",
-              ("nordland_27592", "nordland"), _SEASONS),
-    Published("nordland_3450", "Nordland, the test part of Olid, Facil and Civera", LAYOUT_3450, 3450,
-              {"nordland_3450": 3450}, nordland_3450, "http://webdiis.unizar.es/~jmfacil/pr-nordland/",
-              ("nordland_3450",), _SEASONS),
-    Published("nordland_vprbench", "Nordland*, VPR-Bench's: winter, every tenth frame of summer", LAYOUT_VPRBENCH,
-              27_592, {"nordland_vprbench": 2760}, nordland_vprbench,
-              "https://github.com/MubarizZaffar/VPR-Bench", ("nordland_vprbench",)),
-    Published("robotcar_seasons", "Oxford RobotCar Seasons v2, rear camera, seven conditions against summer",
-              ROBOTCAR_LAYOUT, 220, dict(zip(CONDITIONS, (218, 179, 183, 218, 195, 192, 226), strict=True)),
-              robotcar_seasons, "https://www.visuallocalization.net/datasets/",
-              ("robotcar_seasons", "RobotCar-Seasons")),
-    *(
-        Published(f"pitts30k_{part}", f"Pittsburgh30k, {part} part", PITTSBURGH_LAYOUT.format(part=part), 10_000,
-                  {f"pitts30k_{part}": queries}, partial(pitts30k, name=f"pitts30k_{part}"),
-                  "on request from its authors: https://github.com/Relja/netvlad", (f"pitts30k_{part}", "pitts30k"))
-        for part, queries in (("val", 7608), ("test", 6816))
-    ),
-    Published("msls_val", "Mapillary Street-Level Sequences, validation part", MSLS_LAYOUT, 18_871,
-              {"msls_val": 740}, msls_val, "https://www.mapillary.com/dataset/places", ("msls_val", "msls")),
-)  # fmt: skip
-PUBLISHED = {entry.name: entry for entry in _ENTRIES}
+
+
+PUBLISHED = {entry.name: entry for entry in _published()}

@@ -63,10 +63,7 @@ def absent_ranking(ranked: Ranked, truth: Truth, threshold: float) -> Ranked:
     images to leave out has no candidates: it shows an absent place as it is.
     """
     place = truth.shows_place(AROUND * max(threshold, 1))
-    is_left_out = place.contains(ranked.rows) | (place.counts == 0)[:, None]
-    order = np.argsort(is_left_out, axis=1, kind="stable")
-    values = np.where(is_left_out, -1, ranked.rows), np.where(is_left_out, np.nan, ranked.scores)
-    return Ranked(*(np.take_along_axis(each, order, axis=1) for each in values))
+    return ranked.without(place.contains(ranked.rows) | (place.counts == 0)[:, None])
 
 
 def fit_on_drive(

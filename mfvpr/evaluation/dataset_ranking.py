@@ -21,7 +21,8 @@ from mfvpr.datasets.positives import Positives
 from mfvpr.evaluation import stages
 from mfvpr.evaluation.rankings import Matched, Ranked, rank_by_scores
 from mfvpr.evaluation.system import Pipeline, System, folders_of
-from mfvpr.matchers.host_matcher import Side
+from mfvpr.features.extractor import Source
+from mfvpr.matchers.host_matcher import PairSource, Side
 from mfvpr.matchers.match_set import MatchSet
 from mfvpr.retrieval.retriever import RetrievalResult, fit_to_database, fit_to_sequence
 from mfvpr.storage.cache_files import MatchStore
@@ -155,6 +156,10 @@ def match_sequence(
     cache, database = cache or FeatureCache(), dataset.database
     watch = cache.watch or Stopwatch()
     cache = replace(cache, runtime=runtime or cache.runtime, watch=watch)
+    tool, masks = pipeline.image_source or pipeline.extractor, database.masks or sequence.images.masks
+    if masks is not None and isinstance(tool, PairSource | Source):
+        got = f"{type(tool).__name__}, which knows no masks; leave them out"
+        raise InputError(f"masks={masks}: expected an extractor and a matcher of its features, got {got}")
     if pipeline.pixels is not None:
         pipeline = pipeline.with_image_size(pipeline.size_for_images(folders_of(dataset), cache.warn))
     if pipeline.image_source is None:

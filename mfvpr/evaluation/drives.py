@@ -257,11 +257,9 @@ class DriveFilter:
         hidden = np.zeros((len(ranked.rows), num_rows), bool) if excluded is None else excluded
         size, most_hidden = ranked.rows.shape[1], int(hidden.sum(axis=1).max(initial=0))
         followed = follow(Evidence.of(ranked), self.drive, np.ones(num_rows, bool), self.method, size + most_hidden)
-        is_hidden = np.take_along_axis(hidden, followed.rows, axis=1)
-        order = np.argsort(is_hidden, axis=1, kind="stable")[:, :size]
-        p = followed.p * (1 - followed.off[:, None])
-        values = np.where(is_hidden, -1, followed.rows), np.where(is_hidden, np.nan, p)
-        return Ranked(*(np.take_along_axis(each, order, axis=1) for each in values))
+        ranking = Ranked(followed.rows, followed.p * (1 - followed.off[:, None]))
+        ranking = ranking.without(np.take_along_axis(hidden, followed.rows, axis=1))
+        return Ranked(ranking.rows[:, :size], ranking.scores[:, :size])
 
 
 def follow(

@@ -63,6 +63,12 @@ class Ranked:
         order, rows = rank_shortlist(candidates, scores, ties=ties), np.where(candidates.mask, candidates.indices, -1)
         return cls(*(np.take_along_axis(values, order, axis=1) for values in (rows, scores)))
 
+    def without(self, is_left_out: Bool[np.ndarray, "queries candidates"]) -> "Ranked":
+        """The ranking without some of its candidates: -1 and NaN at its end."""
+        order = np.argsort(is_left_out, axis=1, kind="stable")
+        values = np.where(is_left_out, -1, self.rows), np.where(is_left_out, np.nan, self.scores)
+        return Ranked(*(np.take_along_axis(each, order, axis=1) for each in values))
+
     @property
     def shortlist(self) -> Shortlist:
         """The ranking as a shortlist, to be written (`mfvpr.io.write_shortlist`) or matched again."""

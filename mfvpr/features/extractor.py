@@ -2,21 +2,24 @@
 
 import itertools
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import NamedTuple, Protocol, runtime_checkable
 
+import cv2
 import jax
 import numpy as np
 from jaxtyping import Float, Num
 
 from mfvpr.core.types import Features
 from mfvpr.datasets.datasets import ImageFolder
-from mfvpr.datasets.image_reading import Interpolation, resize
+from mfvpr.datasets.image_reading import Ignored, Interpolation, resize
 from mfvpr.features.feature_set import FeatureSource, check_features, without_padding
 from mfvpr.features.vlad import VladFitting
 from mfvpr.utils.errors import InputError, require_word
 from mfvpr.utils.numerics import available_cpus
 from mfvpr.utils.runtime import Track, no_progress, ordered_map
+
+BORDER = 4  # px around ignored pixels, where filling them makes edges
 
 
 class Scale(NamedTuple):
@@ -133,17 +136,18 @@ def describe_folder(
         raise InputError(f"batch_size={extractor.batch_size}: expected a whole number above 0")
     require_word("interpolation", extractor.interpolation, Interpolation)  # `load` would take it for a bad image
 
-    def load(row: int) -> np.ndarray | InputError:
+    def load(row: int) -> tuple[Num[np.ndarray, "_ _ 3"], Ignored | None] | InputError:
         try:
-            return resize(folder.read(row), extractor.image_size, extractor.interpolation)
+            image, ignored = folder.read_with_ignored(row)
+            return resize(image, extractor.image_size, extractor.interpolation), ignored
         except InputError as error:
             return error
 
-    def readable() -> Iterator[tuple[int, np.ndarray]]:
+    def readable() -> Iterator[tuple[int, np.ndarray, Ignored | None]]:
         images = ordered_map(load, rows, workers=available_cpus())
         for row, image in zip(rows, track(images, len(rows)), strict=True):
             if not isinstance(image, InputError):
-                yield row, image
+                yield row, *image
             elif skip_bad:
                 bad[row] = str(image)
             else:
@@ -151,14 +155,27 @@ def describe_folder(
 
     images = readable()
     while batch := list(itertools.islice(images, extractor.batch_size)):
-        batch_rows, arrays = zip(*batch, strict=True)
+        batch_rows, arrays, masks = zip(*batch, strict=True)
         descriptions = {}
-        for row, description in zip(batch_rows, describe_images(np.stack(arrays), extractor), strict=True):
+        described = describe_images(np.stack(arrays), extractor)
+        for row, ignored, description in zip(batch_rows, masks, described, strict=True):
             if description is None:
                 bad[row] = f"{folder.paths[row]}: features are not finite (NaN or infinite); the image ranks last"
             else:
-                descriptions[row] = description
+                descriptions[row] = without_ignored(description, ignored, extractor.image_size)
         yield descriptions
+
+
+def without_ignored(description: Description, ignored: Ignored | None, size: tuple[int, int]) -> Description:
+    """Drop keypoints in ignored pixels of an image, and within `BORDER` px of them at `size` (width, height) px."""
+    if ignored is None:
+        return description
+    local, near = [], cv2.resize(ignored.astype(np.float32), size, interpolation=cv2.INTER_AREA)
+    near = cv2.dilate(near, np.ones((2 * BORDER + 1, 2 * BORDER + 1))) > 0
+    for features in description.local:
+        columns, rows = np.clip(np.rint(features.keypoints).astype(int), 0, np.subtract(size, 1)).T
+        local.append(without_padding(replace(features, mask=~near[rows, columns])))
+    return description._replace(local=tuple(local))
 
 
 def describe_images(images: Num[np.ndarray, "images height width 3"], extractor: Extractor) -> list[Description | None]:

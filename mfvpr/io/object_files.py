@@ -14,10 +14,8 @@ from typing import Any, BinaryIO, ClassVar
 import numpy as np
 import scipy  # its subpackages are imported at their first use
 
-from mfvpr.io.containers import read_npy_header, shorten
+from mfvpr.io.containers import shorten
 from mfvpr.utils.errors import InputError
-
-NUMPY_MAGIC = b"\x93NUMPY"
 
 
 class DataUnpickler(pickle.Unpickler):
@@ -55,19 +53,6 @@ class ArrayUnpickler(DataUnpickler):
         )
         for module in modules
     }
-
-
-def read_objects(file: BinaryIO, expected: str) -> list[Any]:
-    """Objects of a `.npy` file, NumPy's arrays among them; `expected` is for messages.
-
-    Raises:
-        InputError: the file holds other content; any error if it is damaged.
-    """
-    shape, _, dtype = read_npy_header(file)
-    content = ArrayUnpickler(file).load() if dtype.hasobject else None
-    if not isinstance(content, np.ndarray) or content.dtype != object or content.shape != shape:
-        raise InputError(f"expected {expected}, got another object of {dtype} {[*shape]}; use the official file")
-    return content.ravel().tolist()
 
 
 @contextmanager

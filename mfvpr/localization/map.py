@@ -15,7 +15,7 @@ from typing import Any
 
 import jax
 import numpy as np
-from jaxtyping import Bool
+from jaxtyping import Bool, Float, Int
 
 from mfvpr.core.types import Features, Shortlist
 from mfvpr.datasets.datasets import GroundTruth, ImageFolder, image_folder
@@ -26,13 +26,15 @@ from mfvpr.evaluation.dataset_ranking import Reason
 from mfvpr.evaluation.evidence import LEAST_STRENGTH, evidence_scores, reason_against, reason_against_image
 from mfvpr.evaluation.rankings import Ranked, rank_by_scores
 from mfvpr.evaluation.system import System, noise_images
+from mfvpr.features.extractor import Extractor
 from mfvpr.features.feature_set import SHARE, check_features, strength
 from mfvpr.features.vlad import Vlad, VladFitting
 from mfvpr.localization import map_settings, query_steps
 from mfvpr.localization.predictions import Alternative, Localization, Prediction
 from mfvpr.localization.query_steps import Described, Describing, Image
 from mfvpr.localization.route import Route
-from mfvpr.retrieval.standardization import GrowingDatabase, Rule
+from mfvpr.retrieval.retriever import in_turns, scores_of_turns
+from mfvpr.retrieval.standardization import GrowingDatabase, Moments, Rule
 from mfvpr.storage.cache_files import pack_arrays, unpack_arrays
 from mfvpr.storage.feature_cache import FeatureCache
 from mfvpr.storage.maps import Entry, MapFile, check_entry
@@ -84,18 +86,26 @@ class Map:
                 without a confidence; a new map of a system whose image size follows the images (use `create`).
         """
         self.system = map_settings.fit_to_map(Path(folder), system, None, runtime.log)
-        self.extractor, describer = map_settings.describers_of(self.system)
+        self.extractor, self._describers = map_settings.describers_of(self.system)
         self.folder, self.candidates = Path(folder).absolute(), int(self.system.pipeline.candidates)
         self._runtime, self._file, self._lock = runtime, MapFile(self.folder), threading.RLock()
         self._parts = map_settings.parts_of(self.system)
         self._is_checked = False  # whether the file is known to have these parts
-        self._fitting = describer if isinstance(describer, VladFitting) else None  # of a vocabulary
-        self._describing = None if isinstance(describer, VladFitting) else Describing(self.extractor, describer)
+        fitted = (each for each in self._describers if isinstance(each, VladFitting))
+        self._fitting = next(fitted, None)  # of a vocabulary
+        described = [each for each in self._describers if isinstance(each, Extractor)]
+        self._describing = None if self._fitting else Describing(self.extractor, described)
         self._images, self._row_of_name = list[tuple[str, Any]](), dict[str, int]()  # (name, place)
         self._counts, self._strengths = list[int](), [0.0]  # of keypoints, and sums of strengths of the first rows
         self._vectors = np.zeros((0, 0), np.float32)  # `[rows and some more, D]`; NaN of an image without features
-        search: Any = getattr(self.system.pipeline.retriever, "search", None)
-        self._rule, self._standardized = getattr(search, "standardize", "none"), GrowingDatabase()
+        self._rules = [getattr(each.search, "standardize", "none") for each in map_settings.retrievals_of(self.system)]
+        self._standardized = [GrowingDatabase() for _ in self._rules]
+        dimension = self.extractor.scales[0].dimension
+        sizes = [
+            each.num_words * dimension if isinstance(each, VladFitting) else each.vector_size
+            for each in self._describers
+        ]
+        self._slices = [slice(end - size, end) for size, end in zip(sizes, np.cumsum(sizes), strict=True)]
         self._features = OrderedDict[int, Features]()  # of the recently used rows
         self._free_bytes = SHARE * free_host_bytes() if runtime.memory is None else 1e9 * runtime.memory
         self._noise_scores: dict[int, float] = {}  # by the number of rows
@@ -171,12 +181,27 @@ class Map:
                 self._write({"confidence": json.dumps(content | {"confidence": vars(self.confidence)}).encode()})
         return self.confidence
 
-    def localize(self, image: Image, *, recent: int = 0, route: Route | None = None) -> Prediction:
+    def localize(
+        self,
+        image: Image,
+        *,
+        recent: int = 0,
+        route: Route | None = None,
+        among: Sequence[int] | None = None,
+        near: tuple[Sequence[float], float] | None = None,
+    ) -> Prediction:
         """Find where an image, a file or `[H, W, 3]` uint8 RGB, was taken; see `localize_with_evidence`."""
-        return self.localize_with_evidence(image, recent=recent, route=route).prediction
+        return self.localize_with_evidence(image, recent=recent, route=route, among=among, near=near).prediction
 
     def localize_with_evidence(
-        self, image: Image, *, recent: int = 0, before: int | None = None, route: Route | None = None
+        self,
+        image: Image,
+        *,
+        recent: int = 0,
+        before: int | None = None,
+        route: Route | None = None,
+        among: Sequence[int] | None = None,
+        near: tuple[Sequence[float], float] | None = None,
     ) -> Localization:
         """Find where an image was taken, and return its features and matches as well.
 
@@ -188,10 +213,14 @@ class Map:
             recent: number of newest rows to leave out: while a drive is added, they show the same place.
             before: rows from this one on are left out as well, as if the map ended there; None = no such limit.
             route: of the drive that the image is the next one of; the prediction is then `located` on it.
+            among: rows that may be candidates; None = all.
+            near: (place, radius): only images within this distance of a place may be candidates, where places are lists
+                of numbers, such as positions in meters.
 
         Raises:
-            InputError: the map is empty, the image cannot be read, `recent` or `before` is no number of rows, `route`
-                is no `Route`, or as `require_confidence` says.
+            InputError: the map is empty, the image cannot be read, `recent`, `before` or one of `among` is no number of
+                rows, places are no lists of as many numbers as that of `near`, `route` is no `Route`, or as
+                `require_confidence` says.
         """
         if not isinstance(route, Route | None):
             raise InputError(f"route: expected Route(), the same for all images of a drive, got {route!r}")
@@ -203,10 +232,15 @@ class Map:
             pixels, total = query_steps.load(image), len(self)
             described, resized = self.describing.pixels(pixels)
             end = max(0, (total if before is None else min(int(before), total)) - int(recent))
+            allowed = self.there[:end] if near is None else self._near(near)[:end]
+            if among is not None:
+                for row in among:
+                    whole(0, total - 1).check("among", row)
+                allowed &= np.isin(np.arange(end), among)
             reason = reason_against_image(resized)
             if route is not None and self._rule_of(True) == "running" and reason is None:
                 route.see(described[1])
-            localized = self._localize(described, end, pixels.shape[1::-1], reason, route)
+            localized = self._localize(described, allowed, pixels.shape[1::-1], reason, route)
             if route is None:
                 return localized
             refusals = REFUSALS if self.confidence is None else self.confidence.refusals
@@ -224,6 +258,18 @@ class Map:
             got = f"{fitted}; calibrate {mend}"
             raise InputError(f"confidence: expected one that was fitted with standardize={rule}, got {got}")
 
+    def _near(self, near: tuple[Sequence[float], float]) -> Bool[np.ndarray, " rows"]:
+        """Rows whose places are within a distance of a place."""
+        try:
+            place, radius = near
+            places = np.array([place, *(each for _, each in self._images)], np.float64)
+            if places.ndim != 2 or not np.isfinite(places).all() or not radius >= 0:
+                raise ValueError
+        except (TypeError, ValueError):
+            expected = "(place, radius), and places that are lists of as many numbers"
+            raise InputError(f"near={near}: expected {expected}, got a map with places like {self.place(0)}") from None
+        return np.linalg.norm(places[1:] - places[0], axis=1) <= radius
+
     def warm_up(self) -> None:
         """Compile what `localize` needs for images like those of the map; an InputError for an empty map."""
         with self._lock:
@@ -234,7 +280,7 @@ class Map:
             images = self._read_features([*rows.values()])
             for row, features in zip(rows.values(), images, strict=True):
                 query_steps.match_and_score(features, images, self._matcher, self.system.scorers, self._typical)
-                self._localize((features, self._vectors[row]), len(self), self.extractor.image_size, None)
+                self._localize((features, self._vectors[row]), self.there, self.extractor.image_size, None)
 
     def _refresh_images(self) -> None:
         self.refresh()
@@ -243,22 +289,41 @@ class Map:
 
     def _rule_of(self, route: bool) -> Rule | None:
         """Rule by which descriptors are standardized with or without a route; None = they are not."""
-        if self._rule == "none":
+        rules = {*self._rules} - {"none"}
+        if not rules:
             return None
-        return "running" if route and self._rule != "database" else "database"
+        return "running" if route and rules != {"database"} else "database"
+
+    def _retrieve(
+        self, vector: np.ndarray, among: Bool[np.ndarray, " rows"], route: Route | None
+    ) -> tuple[Int[np.ndarray, " candidates"], Float[np.ndarray, " candidates"]]:
+        """Candidates of a query among rows, and their similarities; of two retrievals in turns."""
+        retrieved = []
+        for part, rule, standardized in zip(self._slices, self._rules, self._standardized, strict=True):
+            vectors, query = self._vectors[: len(among), part], vector[part]
+            if rule != "none" and len(among):
+                seen = None if route is None or rule == "database" else route.seen
+                drive = seen and Moments(seen.count, seen.mean[part], seen.square[part])
+                [query], vectors = standardized.standardize(vectors, query[None], drive)
+            retrieved.append(query_steps.nearest(vectors, query, self.candidates, among))
+        if len(retrieved) == 1:
+            return retrieved[0]
+        rows = in_turns([rows for rows, _ in retrieved], self.candidates)
+        return rows, scores_of_turns(self.candidates)[: len(rows)]
 
     def _localize(
-        self, described: Described, end: int, size: tuple[int, int], reason: Reason | None, route: Route | None = None
+        self,
+        described: Described,
+        among: Bool[np.ndarray, " rows"],
+        size: tuple[int, int],
+        reason: Reason | None,
+        route: Route | None = None,
     ) -> Localization:
-        """Localize a described image of (width, height) px among the rows before `end`, if no reason is against it."""
-        features, vector = described
+        """Localize a described image of (width, height) px among rows of the map, if no reason is against it."""
+        (features, vector), end = described, len(among)
         if end and strength(features) < LEAST_STRENGTH * self._strengths[end] / end:
             reason = "too few features"
-        vectors, rule = self._vectors[:end], self._rule_of(route is not None)
-        if rule and end:
-            seen = route.seen if route is not None and rule == "running" else None
-            [vector], vectors = self._standardized.standardize(vectors, vector[None], seen)
-        rows, similarities = query_steps.nearest(vectors, vector, self.candidates)
+        rows, similarities = self._retrieve(vector, among, route)
         if reason is None and not len(rows):
             reason = "no candidates"
         if reason is not None:
@@ -290,7 +355,7 @@ class Map:
             scores = [0.0]
             for image in noise_images(self.extractor.image_size):
                 features, vector = self.describing.image(image)
-                rows, _ = query_steps.nearest(self._vectors[:end], vector, self.candidates)
+                rows, _ = self._retrieve(vector, np.ones(end, bool), None)
                 candidates = self._read_features(rows.tolist())
                 pairs, _ = query_steps.match_and_score(features, candidates, self._matcher, {}, self._typical)
                 scores += [float(evidence_scores(pair)[0]) for pair in pairs]
@@ -346,12 +411,15 @@ class Map:
                 self._is_checked = bool(stored)  # the last part is in every map
             if self._describing is None and (content := self._file.part("vocabulary")) is not None:
                 arrays = unpack_arrays(content)
-                self._describing = Describing(self.extractor, Vlad(arrays["centers"], float(arrays["power"])))
+                vlad = Vlad(arrays["centers"], float(arrays["power"]))
+                described = [each if isinstance(each, Extractor) else vlad for each in self._describers]
+                self._describing = Describing(self.extractor, described)
             for entry, count, strength_sum in self._file.entries(before):
                 if len(self) == len(self._vectors):
                     more = np.zeros((max(_FIRST_ROWS, len(self)), len(entry.vector)), np.float32)
                     self._vectors = np.concatenate([self._vectors.reshape(-1, len(entry.vector)), more])
-                self._vectors[len(self)] = entry.vector if entry.vector.any() else np.nan
+                for part in self._slices:
+                    self._vectors[len(self), part] = entry.vector[part] if entry.vector[part].any() else np.nan
                 self._row_of_name[entry.name] = len(self)
                 self._images.append((entry.name, entry.place))
                 self._counts.append(count)

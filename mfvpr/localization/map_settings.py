@@ -9,6 +9,7 @@ from mfvpr.evaluation.system import Note, System
 from mfvpr.features.extractor import Extractor
 from mfvpr.features.vlad import VladFitting
 from mfvpr.matchers.host_matcher import PairSource
+from mfvpr.retrieval.retriever import Alternating
 from mfvpr.retrieval.search import ExactSearch
 from mfvpr.retrieval.standardization import StandardizedSearch
 from mfvpr.storage.maps import MapFile
@@ -22,35 +23,45 @@ _KEPT = ("features", "retrieval", "matching", "scorer", "candidates", "fusion", 
 _ABOUT = 1.5  # relative difference of numbers of pixels: sides are rounded
 
 
-def describers_of(system: System) -> tuple[Extractor, Extractor | VladFitting]:
+def retrievals_of(system: System) -> list[Any]:
+    """The retrieval of a system, or the two that it asks in turns."""
+    retriever = system.pipeline.retriever
+    return [retriever.first, retriever.second] if isinstance(retriever, Alternating) else [retriever]
+
+
+def describers_of(system: System) -> tuple[Extractor, list[Extractor | VladFitting]]:
     """The extractors of features and of global descriptors; an InputError for a system that a map cannot use."""
-    pipeline, retriever = system.pipeline, system.pipeline.retriever
+    pipeline, retrievals = system.pipeline, retrievals_of(system)
     extractor: Any = pipeline.extractor
-    describer: Any = getattr(retriever, "describer", None)
-    is_own = isinstance(describer, Extractor)
-    if isinstance(getattr(describer, "fitting", None), VladFitting):
-        is_own = describer.extractor is extractor or recipe_of(describer.extractor) == recipe_of(extractor)
+    describers: list[Any] = [getattr(each, "describer", None) for each in retrievals]
+    aggregated = [each for each in describers if isinstance(getattr(each, "fitting", None), VladFitting)]
     needs = {
         "an extractor of local features of one scale": isinstance(extractor, Extractor) and len(extractor.scales) == 1,
         "a matcher that JAX can compile": not isinstance(pipeline.matcher, PairSource),
         "a number of candidates": pipeline.candidates != "all",
         "single images; mfvpr.Route follows a drive": not (system.correlated or system.sequences),
-        "one retrieval by global descriptors without whitening": isinstance(
-            getattr(retriever, "search", None), ExactSearch | StandardizedSearch
+        "retrieval by global descriptors without whitening": all(
+            isinstance(getattr(each, "search", None), ExactSearch | StandardizedSearch) for each in retrievals
         ),
-        "descriptors of an extractor, or Aggregated(extractor, VladFitting()) of its own": is_own,
+        "descriptors of an extractor, or Aggregated(extractor, VladFitting()) of its own": all(
+            each in aggregated or isinstance(each, Extractor) for each in describers
+        )
+        and all(
+            each.extractor is extractor or recipe_of(each.extractor) == recipe_of(extractor) for each in aggregated
+        ),
+        "one vocabulary": len(aggregated) < 2,
     }
     for need, is_met in needs.items():
         if not is_met:
             raise InputError(f"a map needs {need}")
-    return extractor, getattr(describer, "fitting", describer)
+    return extractor, [getattr(each, "fitting", each) for each in describers]
 
 
 def parts_of(system: System) -> dict[str, Any]:
     """What a map keeps of a system: `system`, its settings if it has some, and `recipe`; an InputError without one."""
-    extractor, describer = describers_of(system)
+    extractor, describers = describers_of(system)
     try:
-        parts = {"recipe": {"extractor": recipe_of(extractor), "describer": recipe_of(describer)}}
+        parts = {"recipe": {"extractor": recipe_of(extractor), "describers": recipe_of(describers)}}
     except TypeError as error:
         fix = "by which a map knows what made its features; see mfvpr.utils.recipe_of"
         raise InputError(f"{error}, {fix}") from None

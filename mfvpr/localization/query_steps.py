@@ -10,7 +10,7 @@ from typing import Any
 
 import jax
 import numpy as np
-from jaxtyping import Float, Int, UInt8
+from jaxtyping import Bool, Float, Int, UInt8
 from numpy.typing import ArrayLike
 
 from mfvpr.core.batch import BIN_STEP, score_candidates
@@ -59,7 +59,7 @@ class Describing:
     """Extractors of a map; the features of queries are rounded as a store rounds the features of the map."""
 
     extractor: Extractor  # of local features of one scale
-    describer: Extractor | Vlad  # of global descriptors; may be the same extractor
+    describers: Sequence[Extractor | Vlad]  # of global descriptors, one behind the other; may be the same extractor
 
     def image(self, image: Image) -> Described:
         """Describe one image: a file, or `[H, W, 3]` uint8 RGB in any form that `np.asarray` converts."""
@@ -67,18 +67,23 @@ class Describing:
 
     def pixels(self, pixels: Pixels) -> tuple[Described, Pixels]:
         """Describe one image; also return it at the size of the extractor."""
-        resized, description = self._extract(self.extractor, pixels)
+        networks = [each for each in self.describers if isinstance(each, Extractor) and each is not self.extractor]
+        extractors, extract = [self.extractor, *networks], partial(self._extract, pixels)
+        workers = min(len(extractors), available_cpus())
+        extracted = ordered_map(extract, extractors, workers=workers) if workers > 1 and knows_own_context() else None
+        (resized, description), *others = extracted or map(extract, extractors)
         features = round_as_stored(description.features)
-        if not isinstance(self.describer, Extractor):
-            [vector] = self.describer([features])
-            return (features, vector), resized
-        if self.describer is not self.extractor:
-            _, description = self._extract(self.describer, pixels)
-        if description.vector is None:
+        vectors, next_vectors = list[Any](), (described.vector for _, described in others)
+        for each in self.describers:
+            if isinstance(each, Vlad):
+                vectors += [*each([features])]
+            else:
+                vectors.append(description.vector if each is self.extractor else next(next_vectors))
+        if any(vector is None for vector in vectors):
             raise InputError("describer: gives no global descriptor; expected one that does, or VladFitting()")
-        return (features, np.asarray(description.vector, np.float32).reshape(-1)), resized
+        return (features, np.concatenate(vectors, axis=None, dtype=np.float32)), resized
 
-    def _extract(self, extractor: Extractor, pixels: Pixels) -> tuple[Pixels, Description]:
+    def _extract(self, pixels: Pixels, extractor: Extractor) -> tuple[Pixels, Description]:
         """An image at the size of an extractor, and its description."""
         resized = resize(pixels, extractor.image_size, extractor.interpolation)
         [description] = describe_images(resized[None], extractor)
@@ -89,9 +94,11 @@ class Describing:
     def folder(self, images: ImageFolder, cache: FeatureCache) -> Iterator[dict[int, Described]]:
         """Describe the images of a folder that a cache lacks: batches by row. The cache may skip bad images."""
         [features] = cache.local(images, self.extractor)
-        vectors = cache.vectors(images, self.describer, images) if isinstance(self.describer, Extractor) else None
-        aggregate: Any = self.describer
-        bad, size = {**features.bad, **(vectors.bad if vectors else {})}, self.extractor.batch_size
+        bad, size, vectors = {**features.bad}, self.extractor.batch_size, list[Any]()  # of all images, or functions
+        for each in self.describers:
+            described = cache.vectors(images, each, images) if isinstance(each, Extractor) else None
+            vectors.append(described.values if described else each)
+            bad.update(described.bad if described else {})
         if bad and not cache.skip_bad:
             raise InputError(bad[min(bad)])
         for reason in bad.values():
@@ -101,19 +108,26 @@ class Describing:
             batch = dict(features.source.read(used[start : start + size]))  # also those without keypoints
             if cache.root is None:
                 batch = {row: round_as_stored(local) for row, local in batch.items()}
-            values = vectors.values[[*batch]] if vectors else aggregate([*batch.values()])
+            parts = [each([*batch.values()]) if isinstance(each, Vlad) else each[[*batch]] for each in vectors]
+            values = np.concatenate(parts, axis=1, dtype=np.float32)
             yield dict(zip(batch, zip(batch.values(), values, strict=True), strict=True))
 
 
 def nearest(
-    vectors: Float[np.ndarray, "rows dimensions"], query: Float[np.ndarray, " dimensions"], number: int
+    vectors: Float[np.ndarray, "rows dimensions"],
+    query: Float[np.ndarray, " dimensions"],
+    number: int,
+    among: Bool[np.ndarray, " rows"] | bool = True,
 ) -> tuple[Int[np.ndarray, " candidates"], Float[np.ndarray, " candidates"]]:
-    """At most `number` rows and their products with the query, most similar first, then by row; none that are NaN."""
+    """At most `number` rows and their products with the query, most similar first, then by row; none that are NaN.
+
+    Rows that are not `among` the allowed ones are left out.
+    """
     # Own threads: those of BLAS spin while they wait, which costs a third of the time.
     workers = available_cpus()
     parts = np.array_split(vectors, workers)
     products = np.concatenate([*ordered_map(partial(np.vecdot, query), parts, workers=workers)])
-    rows = np.flatnonzero(np.isfinite(products) & query.any())
+    rows = np.flatnonzero(np.isfinite(products) & query.any() & among)
     if len(rows) > number:
         least = np.partition(products[rows], -number)[-number]
         rows = rows[products[rows] >= least]

@@ -1,11 +1,12 @@
 """Retrieval (the paper's filter): candidates for each query; what it learns from the database, it learns once."""
 
+import itertools
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, fields, is_dataclass, replace
 from typing import TYPE_CHECKING, Any, NamedTuple, Protocol, TypeVar
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 
 from mfvpr.core.types import Shortlist
 from mfvpr.datasets.datasets import ImageFolder, QuerySequence
@@ -80,16 +81,25 @@ class Alternating:
         first, second = (
             each.shortlist(sequence, database, num_candidates, cache) for each in (self.first, self.second)
         )
-        both = np.stack([first.candidates.indices, second.candidates.indices], axis=2).reshape(len(sequence.images), -1)
         indices = np.full(first.candidates.indices.shape, -1, np.int32)
-        for query, candidates in enumerate(both.tolist()):
-            once = [each for each in dict.fromkeys(candidates) if each >= 0][:num_candidates]
-            indices[query, : len(once)] = once
-        scores = 1 - np.arange(num_candidates, dtype=np.float32) / num_candidates
-        shortlist = Shortlist(indices, np.where(indices >= 0, scores[None], 0), indices >= 0)
+        for query, rows in enumerate(zip(first.candidates.indices, second.candidates.indices, strict=True)):
+            candidates = in_turns(rows, num_candidates)
+            indices[query, : len(candidates)] = candidates
+        shortlist = Shortlist(indices, np.where(indices >= 0, scores_of_turns(num_candidates), 0), indices >= 0)
         bad_queries = {row: reason for row, reason in first.bad_queries.items() if row in second.bad_queries}
         bad_database = {row: reason for row, reason in first.bad_database.items() if row in second.bad_database}
         return RetrievalResult(shortlist, bad_queries, bad_database)
+
+
+def in_turns(shortlists: Sequence[Int[np.ndarray, " _"]], number: int) -> Int[np.ndarray, " candidates"]:
+    """At most `number` rows: the first of each shortlist, the second of each, ..., each row once; -1 is no row."""
+    rows = [row for turn in itertools.zip_longest(*shortlists, fillvalue=-1) for row in turn if row >= 0]
+    return np.array([*dict.fromkeys(rows)][:number], np.int32)
+
+
+def scores_of_turns(number: int) -> Float[np.ndarray, " candidates"]:
+    """Scores of candidates in turns, see `Alternating`."""
+    return 1 - np.arange(number, dtype=np.float32) / number
 
 
 @dataclass(frozen=True)

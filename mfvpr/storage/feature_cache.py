@@ -42,10 +42,11 @@ Value = TypeVar("Value")
 
 
 def states(folder: ImageFolder, rows: Iterable[int] | None = None) -> list[str]:
-    """A text for each image, which changes with the file, or with the conversion of its pixels."""
-    names = folder.names if rows is None else [folder.names[row] for row in rows]
-    paths = (f"{folder.root}/{image}" for image in names)
-    return [f"{path} {state_of(path)} {folder.orient} {folder.bits}" for path in paths]
+    """A text for each image, which changes with the file, with its mask, or with the conversion of its pixels."""
+    folders = [folder] if folder.mask_files is None else [folder, folder.mask_files]
+    rows, way = range(len(folder)) if rows is None else rows, f"{folder.orient} {folder.bits}"
+    images = ([f"{each.root}/{each.names[row]}" for each in folders] for row in rows)
+    return [f"{paths} {[*map(state_of, paths)]} {way}" for paths in images]
 
 
 @dataclass

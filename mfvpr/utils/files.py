@@ -6,6 +6,9 @@ import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
+from typing import Any
+
+import yaml
 
 from mfvpr.utils.errors import InputError
 
@@ -76,6 +79,12 @@ def write_text(path: Path, text: str) -> None:
     """Write `printable` text as UTF-8, atomically."""
     with replacing(path) as temporary:
         temporary.write_text(printable(text), encoding="utf-8")
+
+
+def read_yaml(path: Path) -> Any:
+    """The values of a YAML file that belongs to this library."""
+    loader = getattr(yaml, "CSafeLoader", yaml.SafeLoader)  # libyaml's, if it is there, is eight times as fast
+    return yaml.load(path.read_text(encoding="utf-8"), loader)
 
 
 def canonical_name(path: Path | str) -> str:

@@ -7,7 +7,7 @@ import pytest
 
 from mfvpr.checkpoints import REGISTRY, entry_of
 from mfvpr.checkpoints.checkpoint import read_checkpoint
-from mfvpr.checkpoints.conversion import SSM, Table, convert
+from mfvpr.checkpoints.conversion import TABLES, Table, convert
 from mfvpr.checkpoints.networks import plan_network
 from mfvpr.utils import InputError
 from tests import random_checkpoints as checkpoints
@@ -124,7 +124,7 @@ def vacant(shapes):
 def test_vgg16_of_other_classes_is_not_that_of_places365():
     source = vacant(places365_shapes() | {"fc8a_1.weights": (1000, 4096), "fc8a_1.bias": (1000,)})
     with pytest.raises(InputError, match=r"weights .*: expected \(365, 4096\), got \(1000, 4096\)"):
-        convert(source, SSM, plan_network(entry_of("vgg16_places365").builder()).shapes)
+        convert(source, TABLES["ssm"], plan_network(entry_of("vgg16_places365").builder()).shapes)
 
 
 @needs(ALIKED, LIGHTGLUE)

@@ -69,6 +69,15 @@ def test_an_image_that_finds_itself_is_told_and_left_out(small_street, tmp_path,
         assert all(abs(int(name[:4]) - int(query[:4])) > 1 for name in names)
 
 
+def test_only_listed_images_are_candidates(small_street, tmp_path, run):
+    listed = [[2, 3, 4], [], *([query, 7] for query in range(2, 10))]
+    (tmp_path / "among.json").write_text(json.dumps([*enumerate(listed)]))
+    more = ("dataset.ground_truth=order", f"dataset.among={tmp_path}/among.json", "dataset.exclude_neighbors=0")
+    *_, place = run(*same(small_street, *more))
+    names = {query: {f"{row:04d}.png" for row in rows if row != query} for query, rows in enumerate(listed)}
+    assert {int(query[:4]): {*rows} for query, rows in ranked(place).items()} == {q: n for q, n in names.items() if n}
+
+
 def test_labels_are_right_and_make_one_column(small_street, tmp_path, run):
     for side in ("database", "query"):
         lines = [f"{row:04d}.png,floor {row // 5}\n" for row in range(10)]

@@ -11,8 +11,9 @@ import pytest
 
 import mfvpr
 from mfvpr import InputError, load_system
-from mfvpr.cli import evaluation, jobs, programs
-from mfvpr.cli.command_line import alternate
+from mfvpr.checkpoints.networks import RECOMMENDED
+from mfvpr.cli import command_line, evaluation, jobs, programs
+from mfvpr.cli.command_line import translate
 from mfvpr.cli.schema import Evaluate
 from mfvpr.features import AlikedFeatures, Sift, SsmCells
 from mfvpr.storage import FeatureCache
@@ -37,11 +38,22 @@ def test_every_system_loads_or_names_the_weights_to_install(name, tmp_path, monk
             load_system(name)
 
 
+@pytest.mark.parametrize(
+    ("installed", "system"),
+    [((), None), (("aliked-n16",), None), (("xfeat", "efficientnet_lite0"), "fast"), (RECOMMENDED, "mfvpr")],
+)
+def test_without_a_choice_the_best_system_whose_weights_are_installed_runs(installed, system, monkeypatch):
+    monkeypatch.setattr(command_line, "is_installed", lambda entry: entry.name in installed)
+    assert translate("system=auto") == [f"system={system}"] * bool(system)
+    line = f"system=auto: {system}," if system else "mfvpr weights download recommended"
+    assert line in command_line.installed_system()[1]
+
+
 @pytest.mark.parametrize("names", ["[vlad,same]", "[vlad, same]"])
 def test_two_retrievals_are_a_list(names):
     expected = ["~retrieval", "+retrieval@retrieval.vlad=vlad", "+retrieval@retrieval.same=same"]
-    assert alternate(f"retrieval={names}") == expected
-    assert alternate("retrieval=vlad") == ["retrieval=vlad"]
+    assert translate(f"retrieval={names}") == expected
+    assert translate("retrieval=vlad") == ["retrieval=vlad"]
     settings = settings_of(*expected, "retrieval.vlad.num_words=8", "retrieval.same.standardize=running")
     assert settings.retrieval["vlad"]["num_words"] == 8
     with pytest.raises(InputError, match=r"^retrieval.vlad.standardize=all: expected one of auto"):

@@ -51,6 +51,12 @@ def test_pairs_or_positions_of_a_file(folders, tmp_path, suffix, content):
     np.savez(path, **content) if suffix == "npz" else write_text(path, content)
     truth = datasets.folder(*folders, ground_truth=IndexFile(path)).truth
     np.testing.assert_array_equal(truth.positives(25).dense(), [[True, False, True], [False, False, False]])
+    if "utmQ" in content:
+        with one_line_error(f"{path}: expected pairs of images, got positions"):
+            datasets.folder(*folders, ground_truth="none", among=path)
+    else:
+        excluded = datasets.folder(*folders, ground_truth="none", among=path).only.excluded
+        np.testing.assert_array_equal(~excluded.dense(), truth.positives(0).dense())
 
 
 def test_utm_reads_the_file_name_only(tmp_path):

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from mfvpr.checkpoints.checkpoint import read_checkpoint
-from mfvpr.checkpoints.conversion import NETVLAD_MATLAB, convert
+from mfvpr.checkpoints.conversion import TABLES, convert
 from mfvpr.checkpoints.networks import entry_of, plan_network
 from mfvpr.networks import VggNetVlad
 from mfvpr.utils import InputError
@@ -48,9 +48,9 @@ def test_signs_and_axes(tmp_path):
     read = read_checkpoint(write_matlab(tmp_path / "a.mat", matlab_netvlad(4, 3)))
     assert {path: array.shape for path, array in read.items()} == matlab_shapes(4, 3)
     with pytest.raises(InputError, match="of another shape"):
-        convert(read, NETVLAD_MATLAB, plan_network(entry_of("netvlad_pitts30k").builder()).shapes)
+        convert(read, TABLES["netvlad_matlab"], plan_network(entry_of("netvlad_pitts30k").builder()).shapes)
     plan = plan_network(lambda rngs: VggNetVlad(4, 3, original=True, rngs=rngs))
-    parameters = convert(read, NETVLAD_MATLAB, plan.shapes)
+    parameters = convert(read, TABLES["netvlad_matlab"], plan.shapes)
     np.testing.assert_array_equal(parameters["pool.centers"], -read["net.layers.30.weights.1"].T)
     np.testing.assert_array_equal(parameters["pool.assignment.kernel"], read["net.layers.30.weights.0"])
     np.testing.assert_array_equal(parameters["projection.kernel"], read["net.layers.33.weights.0"][0, 0])

@@ -17,7 +17,7 @@ from mfvpr.evaluation.system import noise_images
 from mfvpr.features import Aggregated, Description, Scale, Sift, VladFitting
 from mfvpr.localization import Map, Prediction, query_steps
 from mfvpr.localization.query_steps import match_and_score
-from mfvpr.retrieval import Retrieval
+from mfvpr.retrieval import Alternating, Retrieval, StandardizedSearch
 from mfvpr.storage import FeatureCache
 from mfvpr.storage.maps import check_entry
 from mfvpr.utils import InputError
@@ -201,7 +201,7 @@ def test_a_map_goes_on_where_it_was(dataset, tmp_path):
 def test_a_map_of_other_settings_is_refused(folder):
     for extractor, describer, words in (
         (replace(SIFT, max_keypoints=50), VLAD, "other extractor"),
-        (SIFT, VladFitting(num_words=4), "other describer"),
+        (SIFT, VladFitting(num_words=4), "other describers"),
     ):
         with pytest.raises(InputError, match=f"made with {words}. Use what"):
             Map(folder, map_system(extractor, describer))
@@ -292,6 +292,39 @@ def test_descriptors_may_be_the_extractors_own_or_anothers(dataset, tmp_path):
         known.add(dataset.queries.paths[0], "a query", name="q")
         for image in (*dataset.database.paths, dataset.queries.paths[0]):
             assert len(known.localize(image).alternatives) == 3
+
+
+@pytest.mark.parametrize("rule", ["none", "database"])
+def test_two_retrievals_in_turns_answer_as_an_evaluation(dataset, tmp_path, rule):
+    """One aggregates the local features, the other has an extractor of its own."""
+    second = Retrieval(Constant(), StandardizedSearch(rule))
+    retriever = Alternating(Retrieval(Aggregated(SIFT, VLAD)), second)
+    system = map_system(SIFT, VLAD, candidates=5)
+    known = Map(tmp_path / "map", replace(system, pipeline=replace(system.pipeline, retriever=retriever)))
+    known.learn(dataset.database)
+    known.build(replace(dataset.database, names=dataset.database.names[:9]))
+    for path, name in zip(dataset.database.paths[9:], dataset.database.names[9:], strict=True):
+        known.add(path, name, name=name)
+    result = evaluate_parts(dataset, SIFT, retriever, dict(system.scorers), candidates=5)
+    [ranked] = result.systems["histogram"]
+    for query, path in enumerate(dataset.queries.paths):
+        prediction = known.localize(path)
+        if prediction.reason != "no better than noise":
+            assert rows_of(prediction) == ranked.rows[query].tolist()
+
+
+def test_candidates_are_among_rows_or_near_a_place(dataset, tmp_path):
+    known = Map(tmp_path / "map", map_system(SIFT, VLAD, candidates=4))
+    known.build(dataset.database, [[10.0 * row, 0.0] for row in range(len(dataset.database))])
+    image = dataset.database.paths[7]
+    assert sorted(rows_of(known.localize(image, among=[7, 2, np.int64(3)]))) == [2, 3, 7]
+    assert sorted(rows_of(known.localize(image, near=([70, 8.0], 13)))) == [6, 7, 8]
+    assert rows_of(known.localize(image, near=([70, 0], 13), among=[0, 6, 8], recent=len(known) - 7)) == [6]
+    assert known.localize(image, among=[]).reason == "no candidates"
+    for mistake in ({"among": [len(known)]}, {"among": [0.5]}, {"among": [True]}, {"near": ([0], 5)},
+                    {"near": ("here", 5)}, {"near": ([0, 0], -1)}, {"near": 5}):  # fmt: skip
+        with pytest.raises(InputError, match=r"^(among|near)=[^\n]*: expected [^\n]*$"):
+            known.localize(image, **mistake)
 
 
 # Images without a place

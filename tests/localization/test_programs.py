@@ -161,7 +161,7 @@ def test_mistakes_are_one_line(folder, call_program, arguments, words):
 
 @pytest.mark.parametrize(("more", "words"), [
     (["features.max_keypoints=50"], "was made with other features"),
-    (["retrieval.whiten=4"], "a map needs one retrieval by global descriptors without whitening"),
+    (["retrieval.whiten=4"], "a map needs retrieval by global descriptors without whitening"),
     (["scorer=paper"], "was made with other scorer"),
     (["map=STREET"], "expected a new or empty folder, or a map"),
 ])  # fmt: skip

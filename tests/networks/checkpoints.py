@@ -2,7 +2,7 @@
 
 from functools import partial
 
-from mfvpr.checkpoints.conversion import NETVLAD, convert
+from mfvpr.checkpoints.conversion import TABLES, convert
 from mfvpr.checkpoints.networks import entry_of, plan_network
 from mfvpr.networks import VggNetVlad
 from tests.random_checkpoints import netvlad_shapes, random_checkpoint
@@ -23,4 +23,4 @@ def fill_published(name, tensors):
 def fill_netvlad(clusters, outputs, seed=0):
     """NetVLAD's network with random tensors."""
     tensors = random_checkpoint(netvlad_shapes(clusters, outputs), seed)
-    return fill(partial(VggNetVlad, clusters, outputs), NETVLAD, tensors)
+    return fill(partial(VggNetVlad, clusters, outputs), TABLES["netvlad"], tensors)

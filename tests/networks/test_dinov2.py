@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from flax import nnx
 
-from mfvpr.checkpoints.conversion import DINOV2
+from mfvpr.checkpoints.conversion import TABLES
 from mfvpr.features import Dinov2Features, GlobalDescriptor
 from mfvpr.networks import VisionTransformer
 from mfvpr.networks.vit import TokenDescriptor
@@ -25,7 +25,7 @@ FACETS = ("token", "query", "key", "value")
 
 def network(depth=2, registers=0, seed=0):
     build = partial(VisionTransformer, WIDTH, depth, HEADS, registers=registers)
-    return fill(build, DINOV2, random_checkpoint(dinov2_shapes(WIDTH, depth, registers), seed))
+    return fill(build, TABLES["dinov2"], random_checkpoint(dinov2_shapes(WIDTH, depth, registers), seed))
 
 
 @pytest.mark.optimized

