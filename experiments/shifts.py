@@ -89,7 +89,7 @@ def add_arguments(parser: Parser) -> None:
     parser.add_argument("--seeds", type=int, nargs="+", default=[1, 2], help="of the streets")
     parser.add_argument("--lane", type=float, default=1, help="distance of the queries to the lane, of the usual one")
     parser.add_argument("--shape", default="448x336", help="of the images, px")
-    parser.add_argument("--features", default="aliked", choices=("aliked", "sift"))
+    parser.add_argument("--features", default="aliked", choices=("aliked", "xfeat", "sift"))
     parser.add_argument("--size", nargs="+", default=["auto"], help="features.image_size: auto, WIDTHxHEIGHT, ...")
     parser.set_defaults(run="experiments.shifts:run")
 
