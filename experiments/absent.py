@@ -41,7 +41,11 @@ def row(confidence: Confidence, present: list[Ranked], absent: list[Ranked]) -> 
 
 def run(drives: list[str], features: str) -> None:
     """Print a table of all drives."""
-    datasets, cache, system = datasets_of(drives), FeatureCache(), load_system("mfvpr", features=features)
+    datasets, cache, system = (
+        datasets_of(drives),
+        FeatureCache(),
+        load_system("mfvpr", retrieval="vlad", features=features),
+    )
     data = {name: fit_on_drive(dataset, system, cache)[1] for name, dataset in datasets.items()}
     present = {name: (values.present, values.correct) for name, values in data.items()}
     absent = defaultdict[str, list[Ranked]](list)

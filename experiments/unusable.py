@@ -84,7 +84,7 @@ def row(kind: str, rows: list[int], predictions: list[Prediction]) -> list[str]:
 
 def run(drives: list[str], features: str) -> None:
     """Print a table for each drive."""
-    datasets, system = datasets_of(drives), load_system("mfvpr", features=features)
+    datasets, system = datasets_of(drives), load_system("mfvpr", retrieval="vlad", features=features)
     for name, dataset in datasets.items():
         rng, numbers = np.random.default_rng(0), [*range(len(dataset.queries))]
         with tempfile.TemporaryDirectory() as root:

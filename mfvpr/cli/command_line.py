@@ -36,7 +36,7 @@ from mfvpr.utils.fields import from_values
 
 Job = Callable[[Any], None]  # of the settings of its program
 # Without any of these arguments, `system=auto` chooses.
-_CHOICES = r"[~+]*(system|experiment|features|retrieval|matching|scorer)[=.@]|(?!-m$|--multirun$)-"
+_CHOICES = r"[~+]*(system|experiment|features|retrieval|matching|scorer)[=.@]|-h$|--help|--hydra-help|--info|--config"
 
 
 def run(program: str, find_job: Callable[[], Job]) -> None:
@@ -46,7 +46,8 @@ def run(program: str, find_job: Callable[[], Job]) -> None:
     schema.register()
     typed = sys.argv[1:]
     if program in ("evaluate", "map") and not any(re.match(_CHOICES, each) for each in typed):
-        typed = ["system=auto", *typed]
+        at = next((place for place, each in enumerate(typed) if re.match("[^-].*=", each)), len(typed))
+        typed.insert(at, "system=auto")  # beside the other settings, since Hydra takes one group of them
     is_auto = "system=auto" in typed
     sys.argv[1:] = itertools.chain.from_iterable(map(translate, typed))
 
@@ -94,7 +95,7 @@ def installed_system() -> tuple[list[str], str]:
             about = "whose weights are installed; choose another with system=NAME"
             return [f"system={system}"], f"system=auto: {system}, {about}"
     better = "better with weights: mfvpr weights download recommended"
-    return [], f"system=auto: SIFT and VLAD, which need no weights; {better}"
+    return ["features=sift"], f"system=auto: SIFT and VLAD, which need no weights; {better}"
 
 
 def _set_up_jax(compiled: bool) -> None:

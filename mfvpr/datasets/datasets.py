@@ -91,7 +91,9 @@ class ImageFolder:
     def read_with_ignored(self, row: int) -> tuple[Pixels, Ignored | None]:
         """Read one image as `read` does, and which pixels its mask ignores; None without masks."""
         image, masks = read_image(self.root / self.names[row], orient=self.orient, bits=self.bits), self.mask_files
-        return (image, None) if masks is None else fill_ignored(image, masks.root / masks.names[row])
+        if masks is None:
+            return image, None
+        return fill_ignored(image, masks.root / masks.names[row], orient=self.orient)
 
 
 @dataclass(frozen=True, repr=False)

@@ -82,13 +82,16 @@ def read_image(path: Path | str, *, orient: bool = True, bits: int | None = 16) 
         return np.asarray(rgb.transpose(_TURN[turn]) if turn in _TURN else rgb)
 
 
-def fill_ignored(image: Pixels, mask: Path) -> tuple[Pixels, Ignored]:
+def fill_ignored(image: Pixels, mask: Path, *, orient: bool = True) -> tuple[Pixels, Ignored]:
     """Fill pixels that a mask ignores with the mean color of the other pixels; also return which pixels these are.
 
-    A mask is an image file of any size, black (below 128) where pixels are ignored. Errors are those of `read_image`;
-    also an `InputError` if the mask ignores the whole image.
+    A mask is an image file of the image's shape, of any size, black (below 128) where pixels are ignored. Errors are
+    those of `read_image`; also an `InputError` if the mask has another shape, or ignores the whole image.
     """
-    brightness = Image.fromarray(read_image(mask)).convert("L")
+    brightness, (width, height) = Image.fromarray(read_image(mask, orient=orient)).convert("L"), image.shape[1::-1]
+    if not 0.97 < brightness.width * height / (brightness.height * width) < 1.03:
+        got = f"{brightness.width} x {brightness.height}"
+        raise InputError(f"{mask}: expected a mask in the shape of its image, {width} x {height}, got {got}; turn it")
     ignored = np.asarray(brightness.resize(image.shape[1::-1], Image.Resampling.NEAREST)) < 128
     if ignored.all():
         expected = "a mask with pixels of 128 or more, which are used"

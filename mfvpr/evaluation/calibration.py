@@ -2,7 +2,7 @@
 
 import warnings
 from dataclasses import replace
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
@@ -72,13 +72,14 @@ def fit_on_drive(
     """Fit the confidence of the ranking that decides on a data set; also what it was fitted on.
 
     Each query counts twice: as it is, and without the images of its place, see `calibration_data`. The
-    `rule`, if there is one, replaces that of the retrieval's standardization.
+    `rule`, if there is one, replaces those of the retrieval's standardization but `none` and `database`.
     """
     truth, root, cache = dataset.only.truth, dataset.queries.root, cache or FeatureCache()
     if truth is None:
         raise InputError(f"{dataset.name}: expected a ground truth, which says what is correct, got none")
     if rule is not None:
-        pipeline = replace(system.pipeline, retriever=with_standardization(system.pipeline.retriever, lambda _: rule))
+        change: Any = lambda each: each if each in ("none", "database") else rule  # noqa: E731
+        pipeline = replace(system.pipeline, retriever=with_standardization(system.pipeline.retriever, change))
         system = replace(system, pipeline=pipeline)
     result, threshold = rank_dataset(dataset, system, cache=cache), middle(truth.thresholds())
     [ranked] = result.systems[system.headline]

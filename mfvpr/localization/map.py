@@ -7,7 +7,7 @@ import shutil
 import threading
 import warnings
 from collections import OrderedDict
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
@@ -187,7 +187,7 @@ class Map:
         *,
         recent: int = 0,
         route: Route | None = None,
-        among: Sequence[int] | None = None,
+        among: Iterable[int] | None = None,
         near: tuple[Sequence[float], float] | None = None,
     ) -> Prediction:
         """Find where an image, a file or `[H, W, 3]` uint8 RGB, was taken; see `localize_with_evidence`."""
@@ -200,7 +200,7 @@ class Map:
         recent: int = 0,
         before: int | None = None,
         route: Route | None = None,
-        among: Sequence[int] | None = None,
+        among: Iterable[int] | None = None,
         near: tuple[Sequence[float], float] | None = None,
     ) -> Localization:
         """Find where an image was taken, and return its features and matches as well.
@@ -234,9 +234,10 @@ class Map:
             end = max(0, (total if before is None else min(int(before), total)) - int(recent))
             allowed = self.there[:end] if near is None else self._near(near)[:end]
             if among is not None:
-                for row in among:
+                rows = [*among]
+                for row in rows:
                     whole(0, total - 1).check("among", row)
-                allowed &= np.isin(np.arange(end), among)
+                allowed &= np.isin(np.arange(end), rows)
             reason = reason_against_image(resized)
             if route is not None and self._rule_of(True) == "running" and reason is None:
                 route.see(described[1])

@@ -40,12 +40,17 @@ def test_every_system_loads_or_names_the_weights_to_install(name, tmp_path, monk
 
 @pytest.mark.parametrize(
     ("installed", "system"),
-    [((), None), (("aliked-n16",), None), (("xfeat", "efficientnet_lite0"), "fast"), (RECOMMENDED, "mfvpr")],
+    [
+        ((), "features=sift"),
+        (("aliked-n16",), "features=sift"),
+        (("xfeat", "efficientnet_lite0"), "system=fast"),
+        (RECOMMENDED, "system=mfvpr"),
+    ],
 )
 def test_without_a_choice_the_best_system_whose_weights_are_installed_runs(installed, system, monkeypatch):
     monkeypatch.setattr(command_line, "is_installed", lambda entry: entry.name in installed)
-    assert translate("system=auto") == [f"system={system}"] * bool(system)
-    line = f"system=auto: {system}," if system else "mfvpr weights download recommended"
+    assert translate("system=auto") == [system]
+    line = "mfvpr weights download recommended" if system == "features=sift" else f"system=auto: {system[7:]},"
     assert line in command_line.installed_system()[1]
 
 

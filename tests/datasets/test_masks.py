@@ -50,6 +50,24 @@ def test_another_mask_gives_other_features(root, on_disk):
     assert lowest[1] < 40 < lowest[0]
 
 
+@pytest.mark.parametrize("orient", [True, False])
+def test_a_mask_with_the_orientation_of_its_photograph_is_turned_with_it(tmp_path, orient):
+    turned = Image.Exif()
+    turned[0x0112] = 6
+    for folder, pixels in (
+        ("images", np.full((120, 160), 99)),
+        ("masks", 255 * (np.arange(120) < 60)[:, None].repeat(160, 1)),
+    ):
+        (tmp_path / folder).mkdir()
+        Image.fromarray(pixels.astype(np.uint8)).save(tmp_path / folder / "0.jpg", exif=turned)
+    images = datasets.image_folder(tmp_path / "images", orient=orient, masks=tmp_path / "masks")
+    image, ignored = images.read_with_ignored(0)
+    assert image.shape[:2] == ignored.shape == ((160, 120) if orient else (120, 160))
+    part = ignored[:, :50] if orient else ignored[70:]
+    assert part.all()
+    assert ignored.mean() == pytest.approx(0.5, abs=0.01)
+
+
 def test_masks_of_images(root):
     for name in ("database/0.bmp", "database/1.png.png", "0.png"):  # a subfolder for one side
         write_mask(root / "masks" / name)
@@ -60,6 +78,9 @@ def test_masks_of_images(root):
     write_mask(root / "masks" / "database" / "0.bmp", 0)
     with one_line_error(r"0\.bmp: expected .* 128 or more, .* ignores the whole image"):
         folder.read(0)
+    Image.fromarray(np.full((80, 60), 255, np.uint8)).save(root / "turned.png")
+    with one_line_error(r"turned\.png: expected a mask in the shape of its image, 160 x 120, got 60 x 80; turn it"):
+        datasets.image_folder(root / "database", masks=root / "turned.png").read(0)
     data = datasets.folder(root / "database", root / "queries", ground_truth="order", masks=root / "mask.png")
     with one_line_error(r"mask\.png: expected an extractor .*, got FeatureFiles"):
         match_sequence(data, data.only, Pipeline(FeatureFiles({}), DescriptorFiles({})))

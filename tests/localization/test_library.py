@@ -16,8 +16,10 @@ from mfvpr.evaluation import Ranked, calibration
 from mfvpr.evaluation.dataset_ranking import RankedDataset
 from mfvpr.evaluation.drives import STREETS
 from mfvpr.evaluation.system import noise_images
-from mfvpr.features import VladFitting
+from mfvpr.features import Aggregated, VladFitting
 from mfvpr.localization import map_settings
+from mfvpr.retrieval import Alternating, Retrieval, StandardizedSearch
+from mfvpr.retrieval.retriever import standardizations
 from mfvpr.retrieval.standardization import standardize
 from mfvpr.storage import FeatureCache
 from mfvpr.storage.maps import MapFile
@@ -91,6 +93,23 @@ def test_descriptors_are_standardized_with_and_without_a_route(small_street, tmp
         Map.open(tmp_path).localize(queries[0])
 
 
+def test_a_confidence_is_fitted_by_the_rules_of_a_map(dataset, monkeypatch):
+    """A route changes `auto`, but not a retrieval that is standardized by the database."""
+    searches = [StandardizedSearch("database"), StandardizedSearch("auto")]
+    retriever = Alternating(*(Retrieval(Aggregated(SIFT, VladFitting()), search) for search in searches))
+    system, seen = map_system(SIFT, VladFitting()), []
+
+    def rank(dataset, system, **_):
+        seen.extend(standardizations(system.pipeline.retriever, dataset.sequences))
+        raise InputError("enough")
+
+    monkeypatch.setattr(calibration, "rank_dataset", rank)
+    system = replace(system, pipeline=replace(system.pipeline, retriever=retriever))
+    with pytest.raises(InputError, match="enough"):
+        calibration.fit_on_drive(dataset, system, None, "running")
+    assert sorted(seen) == ["database", "running"]
+
+
 def test_a_robot_off_the_map_has_no_place(street, small_street):
     known, drive_route = Map(street.folder, street.system, confidence=STREETS), Route()
     frames = [read_image(path) for path in sorted((small_street / "database").iterdir())]
@@ -108,7 +127,7 @@ def test_a_map_ranks_by_fused_scores_as_an_evaluation(small_street, tmp_path):
     """The scores are those of `system=mfvpr` in 0.2.0."""
     features = {"features": "sift", "features.max_keypoints": 60, "features.image_size": [160, 120]}
     weights = {"fusion.c": "zscore", "fusion.weights": {"retrieval": 0.5, "anchor": 1}, "final": "combined"}
-    more = {"scorer": "ratio", "retrieval": {"num_words": 8}, "candidates": 5}
+    more = {"scorer": "ratio", "retrieval": "vlad", "retrieval.num_words": 8, "candidates": 5}
     fused = mfvpr.load_system("mfvpr", **features, **weights, **more)
     (tmp_path / "run.json").write_text(json.dumps({"settings": fused.settings}))
     system = mfvpr.load_system(tmp_path / "run.json")

@@ -317,7 +317,7 @@ def test_candidates_are_among_rows_or_near_a_place(dataset, tmp_path):
     known = Map(tmp_path / "map", map_system(SIFT, VLAD, candidates=4))
     known.build(dataset.database, [[10.0 * row, 0.0] for row in range(len(dataset.database))])
     image = dataset.database.paths[7]
-    assert sorted(rows_of(known.localize(image, among=[7, 2, np.int64(3)]))) == [2, 3, 7]
+    assert sorted(rows_of(known.localize(image, among={7, 2, np.int64(3)}))) == [2, 3, 7]
     assert sorted(rows_of(known.localize(image, near=([70, 8.0], 13)))) == [6, 7, 8]
     assert rows_of(known.localize(image, near=([70, 0], 13), among=[0, 6, 8], recent=len(known) - 7)) == [6]
     assert known.localize(image, among=[]).reason == "no candidates"
