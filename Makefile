@@ -1,6 +1,6 @@
-# `make demo` runs the main job on the embedded data set; `make demo WEIGHTS=1` with learned features, whose weights (about
-# 28 MB) it downloads first. Tests: `make test-fast` while editing, `make test` before a
-# commit, `make test-all` before a release, `make test-wheel` for what is installed.
+# `make demo` runs the main job on the embedded data set; `make demo WEIGHTS=1` downloads learned features first and uses
+# them. Tests: `make test-fast` while editing, `make test` before a commit, `make test-all` before a release,
+# `make test-wheel` for what is installed.
 PYTHON ?= python3
 CONSTRAINTS ?= /dev/null
 BIN := .venv/bin

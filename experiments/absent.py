@@ -41,11 +41,8 @@ def row(confidence: Confidence, present: list[Ranked], absent: list[Ranked]) -> 
 
 def run(drives: list[str], features: str) -> None:
     """Print a table of all drives."""
-    datasets, cache, system = (
-        datasets_of(drives),
-        FeatureCache(),
-        load_system("mfvpr", retrieval="vlad", features=features),
-    )
+    datasets, cache = datasets_of(drives), FeatureCache()
+    system = load_system("mfvpr", retrieval="vlad", features=features)
     data = {name: fit_on_drive(dataset, system, cache)[1] for name, dataset in datasets.items()}
     present = {name: (values.present, values.correct) for name, values in data.items()}
     absent = defaultdict[str, list[Ranked]](list)

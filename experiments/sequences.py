@@ -125,11 +125,8 @@ def lines(places: Mapping[str, Sequence[Place]]) -> Iterator[list[str]]:
 
 def run(drives: list[str], features: str) -> None:
     """Print a table of all data sets."""
-    datasets, cache, system = (
-        datasets_of(drives),
-        FeatureCache(),
-        load_system("mfvpr", retrieval="vlad", features=features),
-    )
+    datasets, cache = datasets_of(drives), FeatureCache()
+    system = load_system("mfvpr", retrieval="vlad", features=features)
     places = defaultdict[str, list[Place]](list)
     for name, dataset in datasets.items():
         places[name.partition(".")[0]].append(Place(dataset, system, cache))

@@ -23,7 +23,6 @@ from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 from mfvpr.checkpoints import entry_of, is_installed
-from mfvpr.checkpoints.networks import RECOMMENDED
 from mfvpr.cli import schema
 from mfvpr.cli.console import explain, one_line, tell, warn
 from mfvpr.evaluation import System
@@ -89,9 +88,8 @@ def translate(override: str) -> list[str]:
 
 def installed_system() -> tuple[list[str], str]:
     """`system=auto`: the best recommended system whose weights are installed, or none; and a line that says which."""
-    missing = {name for name in RECOMMENDED if not is_installed(entry_of(name))}
-    for system, needed in (("mfvpr", {"aliked-n16", "efficientnet_lite0"}), ("fast", {"xfeat", "efficientnet_lite0"})):
-        if not needed & missing:
+    for system, network in (("mfvpr", "aliked-n16"), ("fast", "xfeat")):
+        if all(is_installed(entry_of(name)) for name in (network, "efficientnet_lite0")):
             about = "whose weights are installed; choose another with system=NAME"
             return [f"system={system}"], f"system=auto: {system}, {about}"
     better = "better with weights: mfvpr weights download recommended"

@@ -34,7 +34,8 @@ def describers_of(system: System) -> tuple[Extractor, list[Extractor | VladFitti
     pipeline, retrievals = system.pipeline, retrievals_of(system)
     extractor: Any = pipeline.extractor
     describers: list[Any] = [getattr(each, "describer", None) for each in retrievals]
-    aggregated = [each for each in describers if isinstance(getattr(each, "fitting", None), VladFitting)]
+    fitted = [each for each in describers if isinstance(getattr(each, "fitting", None), VladFitting)]
+    is_own = [each.extractor is extractor or recipe_of(each.extractor) == recipe_of(extractor) for each in fitted]
     needs = {
         "an extractor of local features of one scale": isinstance(extractor, Extractor) and len(extractor.scales) == 1,
         "a matcher that JAX can compile": not isinstance(pipeline.matcher, PairSource),
@@ -43,13 +44,9 @@ def describers_of(system: System) -> tuple[Extractor, list[Extractor | VladFitti
         "retrieval by global descriptors without whitening": all(
             isinstance(getattr(each, "search", None), ExactSearch | StandardizedSearch) for each in retrievals
         ),
-        "descriptors of an extractor, or Aggregated(extractor, VladFitting()) of its own": all(
-            each in aggregated or isinstance(each, Extractor) for each in describers
-        )
-        and all(
-            each.extractor is extractor or recipe_of(each.extractor) == recipe_of(extractor) for each in aggregated
-        ),
-        "one vocabulary": len(aggregated) < 2,
+        "descriptors of an extractor, or Aggregated(extractor, VladFitting()) of its own": all(is_own)
+        and len(fitted) + sum(isinstance(each, Extractor) for each in describers) == len(describers),
+        "at most one vocabulary": len(fitted) < 2,
     }
     for need, is_met in needs.items():
         if not is_met:

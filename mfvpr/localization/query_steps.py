@@ -117,7 +117,7 @@ def nearest(
     vectors: Float[np.ndarray, "rows dimensions"],
     query: Float[np.ndarray, " dimensions"],
     number: int,
-    among: Bool[np.ndarray, " rows"] | bool = True,
+    among: Bool[np.ndarray, " rows"],
 ) -> tuple[Int[np.ndarray, " candidates"], Float[np.ndarray, " candidates"]]:
     """At most `number` rows and their products with the query, most similar first, then by row; none that are NaN.
 

@@ -7,11 +7,11 @@ import pytest
 
 import mfvpr
 from mfvpr import ExportShapes, InputError
-from mfvpr.checkpoints import entry_of, is_installed, load_model
+from mfvpr.checkpoints import load_model
 from mfvpr.features import XFeatFeatures
 from tests.builders import local
 from tests.golden.make_d2net import texture
-from tests.needs import needs
+from tests.needs import needs, use_weights
 from tests.networks.checkpoints import fill_published
 from tests.random_checkpoints import random_checkpoint, xfeat_shapes
 
@@ -23,9 +23,9 @@ SIZE, SHAPES = (96, 64), ExportShapes(candidates=1, keypoints=100, image_size=(9
 def extractor(request):
     if request.param == "random":  # with a threshold that fits the weights
         return XFeatFeatures(fill_published("xfeat", random_checkpoint(xfeat_shapes())), SIZE, threshold=0.03)
-    if not is_installed(entry_of("xfeat")):
-        pytest.skip("needs weights: mfvpr weights download xfeat")
-    return XFeatFeatures(load_model("xfeat"), SIZE)
+    with pytest.MonkeyPatch.context() as patch:
+        use_weights("xfeat", patch)
+        return XFeatFeatures(load_model("xfeat"), SIZE)
 
 
 def test_a_program_gives_the_features_of_the_extractor_and_zeros(extractor, tmp_path):
