@@ -1,6 +1,7 @@
 """Checkpoints without torch: a writer of its files, byte by byte; random weights under the public names and shapes."""
 
 import io
+import itertools
 import math
 import pickle
 import struct
@@ -134,6 +135,8 @@ def for_networks() -> Iterator[tuple[str, dict[str, np.ndarray]]]:
     yield "cosplace_vgg16_512", random_checkpoint(gem_shapes("vgg16", 512))
     yield "aliked-n16", random_checkpoint(aliked_shapes((16, 32, 64, 128), 128))
     yield "aliked_lightglue", random_checkpoint(lightglue_shapes())
+    yield "efficientnet_lite0", random_checkpoint(efficientnet_shapes())
+    yield "xfeat", random_checkpoint(xfeat_shapes())
 
 
 def with_biases(weights: Shapes) -> Shapes:
@@ -341,3 +344,20 @@ def xfeat_shapes() -> Shapes:
             shapes |= {f"{layer}.layer.1.running_{name}": (outputs,) for name in ("mean", "var")}
     last: Shapes = {"skip1.1": (24, 1, 1, 1), "keypoint_head.3": (65, 64, 1, 1), "fine_matcher.0": (512, 128)}
     return shapes | with_biases(last | {"block_fusion.2": (64, 64, 1, 1), "heatmap_head.2": (1, 64, 1, 1)})
+
+
+def efficientnet_shapes() -> Shapes:
+    """The tensors of EfficientNet-Lite0's checkpoint, but for the layers behind its last block."""
+    weights: Shapes = {"_conv_stem": (32, 3, 3, 3)}
+    norms, names = {"_bn0": 32}, (f"_blocks.{block}" for block in itertools.count())
+    blocks = ((1, 3, 16), (2, 3, 24), (2, 5, 40), (3, 3, 80), (3, 5, 112), (4, 5, 192), (1, 3, 320))
+    outputs = [32, *(width for number, _, width in blocks for _ in range(number))]
+    sizes = [size for number, size, _ in blocks for _ in range(number)]
+    for name, (inputs, channels), size in zip(names, pairwise(outputs), sizes, strict=False):
+        width = inputs
+        if name != "_blocks.0":
+            width = 6 * inputs
+            weights[f"{name}._expand_conv"], norms[f"{name}._bn0"] = (width, inputs, 1, 1), width
+        weights[f"{name}._depthwise_conv"], norms[f"{name}._bn1"] = (width, 1, size, size), width
+        weights[f"{name}._project_conv"], norms[f"{name}._bn2"] = (channels, width, 1, 1), channels
+    return {f"{name}.weight": shape for name, shape in weights.items()} | _norms(norms)

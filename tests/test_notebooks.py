@@ -28,7 +28,7 @@ def executed(tmp_path_factory):
     notebooks = [nbformat.read(path, as_version=4) for path in PATHS]
 
     async def execute():
-        clients = (NotebookClient(book, timeout=200, resources={"metadata": {"path": folder}}) for book in notebooks)
+        clients = (NotebookClient(book, timeout=900, resources={"metadata": {"path": folder}}) for book in notebooks)
         return await asyncio.gather(*(client.async_execute() for client in clients), return_exceptions=True)
 
     with pytest.MonkeyPatch.context() as patch:
@@ -60,6 +60,7 @@ def test_the_output_is_that_of_the_code(path):
 
 
 @pytest.mark.slow
+@pytest.mark.timeout(1800)  # all of them run at once, before the first
 @pytest.mark.parametrize("path", PATHS, ids=lambda path: path.stem)
 def test_they_run_and_show_pictures(path, executed):
     result = executed[0][path]
@@ -71,6 +72,7 @@ def test_they_run_and_show_pictures(path, executed):
 
 
 @pytest.mark.slow
+@pytest.mark.timeout(1800)
 def test_they_leave_no_files(executed):
     assert not list(executed[1].iterdir())
     assert {path.suffix for path in FOLDER.iterdir() if path.is_file()} == {".ipynb", ".py"}

@@ -8,6 +8,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
+from types import SimpleNamespace
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
@@ -133,8 +134,10 @@ def plan_network(build: Callable[..., "nnx.Module"]) -> Blueprint:
     import jax
     from flax import nnx
 
+    key = jax.random.key(0)
+    keys: Any = SimpleNamespace(params=lambda: key)  # tracing the counters of nnx.Rngs takes twice as long as the rest
     with jax.numpy_dtype_promotion("standard"):  # Flax's initializers mix types
-        module = nnx.eval_shape(lambda: build(rngs=nnx.Rngs(0)))
+        module = nnx.eval_shape(lambda: build(rngs=keys))
     shapes = {_path(keys): leaf.shape for keys, leaf in nnx.to_flat_state(nnx.state(module))}
     parameters = sum(math.prod(leaf.shape) for leaf in jax.tree.leaves(nnx.state(module, nnx.Param)))
     return Blueprint(shapes, parameters, module)

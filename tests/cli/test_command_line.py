@@ -101,7 +101,7 @@ def test_mistakes_about_data_are_one_line(root, refuse_at_once, program, argumen
 @pytest.mark.slow
 def test_a_device_that_is_not_there_is_one_line():
     for name in ("cuda", "nonsense"):
-        done = run("candidates=3", JAX_PLATFORMS=name)
+        done = run("features=sift", JAX_PLATFORMS=name)
         assert done.returncode == 2
         assert f"error: JAX_PLATFORMS={name}: expected a device" in done.stderr
         assert done.stderr.count("\n") == 1
