@@ -349,9 +349,15 @@ class Map:
             prediction = prediction.without_place("low confidence")
         return Localization(prediction, described, jax.tree.map(lambda leaf: leaf[0], best))
 
-    def _noise_score(self, end: int) -> float:
-        """The best score of noise images; while a map grows, it changes when the number of rows has doubled."""
+    def _noise_score(self, end: int, *, store: bool = False) -> float:
+        """The best score of noise images; while a map grows, it changes when the number of rows has doubled.
+
+        With `store`, while the lock is held, other processes need not compute it.
+        """
         end = 1 << max(0, end.bit_length() - 1)
+        part = f"noise score of {end} rows"
+        if end not in self._noise_scores and (stored := self._file.part(part)):
+            self._noise_scores[end] = float(stored)
         if end not in self._noise_scores:
             scores = [0.0]
             for image in noise_images(self.extractor.image_size):
@@ -361,6 +367,8 @@ class Map:
                 pairs, _ = query_steps.match_and_score(features, candidates, self._matcher, {}, self._typical)
                 scores += [float(evidence_scores(pair)[0]) for pair in pairs]
             self._noise_scores[end] = float(np.max(scores))
+            if store:
+                self._write({part: str(self._noise_scores[end]).encode()})
         return self._noise_scores[end]
 
     def _rank(self, rows: np.ndarray, similarities: np.ndarray, scores: Mapping[str, np.ndarray]) -> Ranked:
@@ -463,6 +471,7 @@ class Map:
                 for batch in self.describing.folder(replace(images, names=names), cache):
                     entries = [Entry(names[row], place_of[names[row]], vector) for row, (_, vector) in batch.items()]
                     self._add(entries, [features for features, _ in batch.values()])
+                self._noise_score(len(self), store=True)
                 return len(self) - before
 
     def add(self, image: Image, place: Any, *, name: str | None = None) -> None:

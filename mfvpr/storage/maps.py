@@ -63,7 +63,7 @@ class MapFile:
             raise InputError(f"{folder}: expected a new or empty folder, or a map; name another")
 
     def part(self, name: str) -> bytes | None:
-        """A part that was written: settings, vocabulary or confidence; None if it was not. InputError if damaged."""
+        """A part that was written, such as settings or vocabulary; None if it was not. InputError if damaged."""
         query = "SELECT value, checksum FROM parts WHERE name = ?"
         with self._open() as database:
             row: tuple[bytes, int] | None = database and database.execute(query, [name]).fetchone()
