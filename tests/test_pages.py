@@ -7,6 +7,7 @@ import subprocess
 import sys
 
 import pytest
+from PIL import Image
 
 from mfvpr.cli import schema
 from mfvpr.cli.command_line import compose_data_sets
@@ -88,6 +89,7 @@ def test_code_runs(page, small_street, tmp_path):
         shutil.copytree(small_street / side, tmp_path / side)
     for side, name in (("queries", "query.jpg"), ("database", "candidate.jpg")):
         shutil.copy(small_street / side / "0004.png", tmp_path / name)
+    Image.new("L", (320, 240), 255).save(tmp_path / "hood.png")
     script = tmp_path / "page.py"
     script.write_text("\n".join(blocks(page, "python")))
     done = subprocess.run([sys.executable, script], cwd=tmp_path, capture_output=True, text=True)

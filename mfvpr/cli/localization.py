@@ -46,12 +46,13 @@ def print_map(folder: Path) -> None:
     print(json.dumps(settings, indent=1, ensure_ascii=False))
 
 
-def calibrate(folder: Path, database: Path, queries: Path, *, route: bool = False) -> None:
+def calibrate(folder: Path, database: Path, queries: Path, *, masks: Path | None = None, route: bool = False) -> None:
     """Fit the confidence of a map on a drive: query i shows database image i, both folders of images along a path.
 
+    `masks`: an image that is black where pixels of all images are ignored, or a folder with one for each image.
     `route`: for mfvpr localize route=..., where the retrieval standardizes descriptors.
     """
-    Map.open(folder).calibrate(database, queries, route=route)
+    Map.open(folder).calibrate(database, queries, masks=masks, route=route)
     print(printable(f"{folder}: calibrated on {queries}; use threshold= of mfvpr localize"))
 
 
@@ -107,6 +108,7 @@ class _Drive:
         self._wanted = set(range(figures) if isinstance(figures, int) else figures)
         self.missing = set() if isinstance(figures, int) else {*self._wanted}  # figures whose image did not come
         self.failed = 0
+        self._mask = None if settings.mask is None else expand_user(settings.mask)
         self._root = None if settings.root is None else expand_user(settings.root)
         if self._root and not self._root.is_dir():
             raise InputError(f"root={self._root}: expected the folder of the map's images, got no folder")
@@ -117,7 +119,9 @@ class _Drive:
         row = known.row(name) if settings.add else None  # an image that is in the map sees the images before it
         try:
             pixels = image if isinstance(image, np.ndarray) else read_image(image)
-            localized = known.localize_with_evidence(pixels, recent=settings.recent, before=row, route=self._route)
+            localized = known.localize_with_evidence(
+                pixels, recent=settings.recent, before=row, route=self._route, mask=self._mask
+            )
         except InputError as error:
             if not len(known):
                 raise

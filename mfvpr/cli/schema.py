@@ -201,6 +201,7 @@ class Localize(Resources):
     images: Any = setting(REQUIRED, or_list(PATH), "image, folder of images, or video; or [PATH,PATH]")
     watch: bool = setting(False, FLAG, "of a folder: localize new images as well, until Ctrl-C")
     every: int = setting(1, COUNT, "of a video: every so many frames")
+    mask: str | None = setting(None, PATH | None, "image that is black where pixels are ignored, such as on the hood")
     alternatives: int = setting(5, INDEX, "candidates in each line")
     recent: int = setting(0, INDEX, "newest images to leave out: of a drive that is added, they show the same place")
     confidence: str | None = setting(None, PATH | None, "confidence.json of an evaluation; null = that of the map")

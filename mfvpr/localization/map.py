@@ -160,6 +160,7 @@ class Map:
         queries: Path | str,
         *,
         ground_truth: GroundTruth | str = "order",
+        masks: Path | str | None = None,
         cache: FeatureCache | None = None,
         route: bool = False,
     ) -> Confidence:
@@ -168,10 +169,10 @@ class Map:
         It holds for drives like this one. Correct is a prediction within 2 frames, or 25 m. Each query counts once more
         without the images of its place, as one of a place that the map does not show. `database` is a folder of images
         along a path, preferably another than that of the map, `queries` one of a drive along this path; for
-        `ground_truth`, see `mfvpr.datasets.folder`. The cache keeps features. If the retrieval standardizes
+        `ground_truth` and `masks`, see `mfvpr.datasets.folder`. The cache keeps features. If the retrieval standardizes
         descriptors, it holds either with a `route` or for images without one.
         """
-        dataset = folder_dataset(database, queries, ground_truth=ground_truth)
+        dataset = folder_dataset(database, queries, ground_truth=ground_truth, masks=masks)
         self.confidence, data = fit_on_drive(dataset, self.system, cache, self._rule_of(route))
         if (of_system := map_settings.system_fingerprint(self.system)) is None:
             warnings.warn("a part of the system names no `recipe`: the confidence is not kept on disk", stacklevel=2)
@@ -189,9 +190,12 @@ class Map:
         route: Route | None = None,
         among: Iterable[int] | None = None,
         near: tuple[Sequence[float], float] | None = None,
+        mask: Path | str | None = None,
     ) -> Prediction:
         """Find where an image, a file or `[H, W, 3]` uint8 RGB, was taken; see `localize_with_evidence`."""
-        return self.localize_with_evidence(image, recent=recent, route=route, among=among, near=near).prediction
+        return self.localize_with_evidence(
+            image, recent=recent, route=route, among=among, near=near, mask=mask
+        ).prediction
 
     def localize_with_evidence(
         self,
@@ -202,6 +206,7 @@ class Map:
         route: Route | None = None,
         among: Iterable[int] | None = None,
         near: tuple[Sequence[float], float] | None = None,
+        mask: Path | str | None = None,
     ) -> Localization:
         """Find where an image was taken, and return its features and matches as well.
 
@@ -216,11 +221,12 @@ class Map:
             among: rows that may be candidates; None = all.
             near: (place, radius): only images within this distance of a place may be candidates, where places are lists
                 of numbers, such as positions in meters.
+            mask: image file that is black where pixels are ignored, such as on the robot's own hood.
 
         Raises:
-            InputError: the map is empty, the image cannot be read, `recent`, `before` or one of `among` is no number of
-                rows, places are no lists of as many numbers as that of `near`, `route` is no `Route`, or as
-                `require_confidence` says.
+            InputError: the map is empty, the image or the mask cannot be read, `recent`, `before` or one of `among` is
+                no number of rows, places are no lists of as many numbers as that of `near`, `route` is no `Route`, or
+                as `require_confidence` says.
         """
         if not isinstance(route, Route | None):
             raise InputError(f"route: expected Route(), the same for all images of a drive, got {route!r}")
@@ -230,7 +236,6 @@ class Map:
         with self._lock:
             self._refresh_images()
             pixels, total = query_steps.load(image), len(self)
-            described, resized = self.describing.pixels(pixels)
             end = max(0, (total if before is None else min(int(before), total)) - int(recent))
             allowed = self.there[:end] if near is None else self._near(near)[:end]
             if among is not None:
@@ -238,6 +243,7 @@ class Map:
                 for row in rows:
                     whole(0, total - 1).check("among", row)
                 allowed &= np.isin(np.arange(end), rows)
+            described, resized = self.describing.pixels(pixels, mask)
             reason = reason_against_image(resized)
             if route is not None and self._rule_of(True) == "running" and reason is None:
                 route.see(described[1])

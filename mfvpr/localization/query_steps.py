@@ -18,9 +18,9 @@ from mfvpr.core.histogram import HistogramOfShifts
 from mfvpr.core.scorer import Scorer, fit_capacities, require_scores
 from mfvpr.core.types import Features, Matches
 from mfvpr.datasets.datasets import ImageFolder
-from mfvpr.datasets.image_reading import read_image, resize
+from mfvpr.datasets.image_reading import Ignored, fill_ignored, read_image, resize
 from mfvpr.evaluation.stages import pair_shifts, require_finite
-from mfvpr.features.extractor import Description, Extractor, describe_images
+from mfvpr.features.extractor import Description, Extractor, describe_images, without_ignored
 from mfvpr.features.feature_set import STEP, stack_features
 from mfvpr.features.vlad import Vlad
 from mfvpr.matchers.matcher import Matcher, match_pairs
@@ -65,10 +65,11 @@ class Describing:
         """Describe one image: a file, or `[H, W, 3]` uint8 RGB in any form that `np.asarray` converts."""
         return self.pixels(load(image))[0]
 
-    def pixels(self, pixels: Pixels) -> tuple[Described, Pixels]:
-        """Describe one image; also return it at the size of the extractor."""
+    def pixels(self, pixels: Pixels, mask: Path | str | None = None) -> tuple[Described, Pixels]:
+        """Describe one image without what a mask ignores; also return it at the size of the extractor."""
+        pixels, ignored = (pixels, None) if mask is None else fill_ignored(pixels, Path(mask))
         networks = [each for each in self.describers if isinstance(each, Extractor) and each is not self.extractor]
-        extractors, extract = [self.extractor, *networks], partial(self._extract, pixels)
+        extractors, extract = [self.extractor, *networks], partial(self._extract, pixels, ignored)
         workers = min(len(extractors), available_cpus())
         extracted = ordered_map(extract, extractors, workers=workers) if workers > 1 and knows_own_context() else None
         (resized, description), *others = extracted or map(extract, extractors)
@@ -83,13 +84,13 @@ class Describing:
             raise InputError("describer: gives no global descriptor; expected one that does, or VladFitting()")
         return (features, np.concatenate(vectors, axis=None, dtype=np.float32)), resized
 
-    def _extract(self, pixels: Pixels, extractor: Extractor) -> tuple[Pixels, Description]:
-        """An image at the size of an extractor, and its description."""
+    def _extract(self, pixels: Pixels, ignored: Ignored | None, extractor: Extractor) -> tuple[Pixels, Description]:
+        """An image at the size of an extractor, and its description without what is ignored."""
         resized = resize(pixels, extractor.image_size, extractor.interpolation)
         [description] = describe_images(resized[None], extractor)
         if description is None:
             raise InputError("image: features are not finite (NaN or infinite)")
-        return resized, description
+        return resized, without_ignored(description, ignored, extractor.image_size)
 
     def folder(self, images: ImageFolder, cache: FeatureCache) -> Iterator[dict[int, Described]]:
         """Describe the images of a folder that a cache lacks: batches by row. The cache may skip bad images."""

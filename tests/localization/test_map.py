@@ -10,6 +10,7 @@ from PIL import Image
 
 import mfvpr
 from mfvpr.core.types import Features
+from mfvpr.datasets import image_folder
 from mfvpr.evaluation import Confidence
 from mfvpr.evaluation.evidence import LEAST_MATCHES
 from mfvpr.evaluation.stages import explain
@@ -24,7 +25,9 @@ from mfvpr.utils import InputError
 from tests import scorers
 from tests.builders import evaluate_parts, make_features, map_system
 from tests.core.test_types import Tensor as TensorWithGradient
+from tests.io.checks import one_line_error
 from tests.programs import snapshot
+from tests.storage.synthetic_features import assert_same
 
 pytestmark = pytest.mark.thorough
 
@@ -311,6 +314,25 @@ def test_two_retrievals_in_turns_answer_as_an_evaluation(dataset, tmp_path, rule
         prediction = known.localize(path)
         if prediction.reason != "no better than noise":
             assert rows_of(prediction) == ranked.rows[query].tolist()
+
+
+def test_the_robots_hood_is_ignored_as_in_an_evaluation(small_street, tmp_path):
+    hood = np.full((240, 320), 255, np.uint8)
+    hood[120:] = 0
+    Image.fromarray(hood).save(tmp_path / "hood.png")
+    database = image_folder(small_street / "database", masks=tmp_path / "hood.png")
+    known = Map.create(tmp_path / "map", database, map_system(SIFT, VladFitting(num_words=8), candidates=5))
+    path = small_street / "queries" / "0003.png"
+    localized = known.localize_with_evidence(path, mask=tmp_path / "hood.png")
+    masked, plain = localized.described[0], known.localize_with_evidence(path).described[0]
+    height = SIFT.image_size[1]
+    assert masked.keypoints[:, 1].max() < height / 2 < plain.keypoints[:, 1].max()
+    queries = image_folder(small_street / "queries", masks=tmp_path / "hood.png")
+    assert_same(masked, FeatureCache(tmp_path / "cache").local(queries, SIFT)[0][3])
+    with one_line_error(r"missing\.png: "):
+        known.localize(path, mask=tmp_path / "missing.png")
+    with pytest.warns(UserWarning, match="calibrate on a longer drive"):
+        known.calibrate(small_street / "database", small_street / "queries", masks=tmp_path / "hood.png")
 
 
 def test_candidates_are_among_rows_or_near_a_place(dataset, tmp_path):
