@@ -3,6 +3,7 @@
 import pytest
 
 from tests.features.conftest import read_rows
+from tests.needs import use_weights
 from tests.programs import ROOT
 
 pytestmark = pytest.mark.slow
@@ -71,6 +72,15 @@ def test_aliked_recognizes_the_street(evaluate, real_weights, tmp_path, monkeypa
     (recall,) = (row["recall_at"]["1"] for row in rows if (row["system"], row.get("tolerance")) == ("histogram", 1))
     assert recall >= 0.8
     assert (out / "predictions.csv").read_bytes() == (out / "predictions/histogram.csv").read_bytes()
+
+
+def test_the_fast_system_recognizes_the_street(evaluate, tmp_path, monkeypatch):
+    for name in ("efficientnet_lite0", "xfeat"):
+        use_weights(name, monkeypatch)
+    evaluate("system=fast", "candidates=10", "figures=0")
+    rows = [row for row in read_rows(tmp_path / "out") if row.get("tolerance") == 1]
+    recall = {row["system"]: row["recall_at"]["1"] for row in rows}
+    assert recall["histogram"] >= 0.8 > recall["retrieval"]
 
 
 def test_lightglue_matches_the_street_and_its_store_is_its_own(evaluate, real_weights, tmp_path, monkeypatch):
