@@ -10,7 +10,7 @@ import pytest
 from PIL import Image
 
 from mfvpr.cli import schema
-from mfvpr.cli.command_line import compose_data_sets
+from mfvpr.cli.command_line import compose_data_sets, with_paths_as_settings
 from mfvpr.cli.programs import COMMANDS as PROGRAMS
 from mfvpr.systems.assembly import CONF, GROUPS, choices_of
 from mfvpr.utils.fields import settings_of
@@ -30,7 +30,7 @@ PAGES = {
 RESULTS = PAGES.get("experiments/results.md", "")
 CONFIGS = {"mfvpr evaluate": "evaluate", "mfvpr sweep": "sweep", "mfvpr learn": "learn", "mfvpr map build": "map",
            "mfvpr localize": "localize", "python -m experiments.paper": "paper"}  # fmt: skip
-PLACEHOLDERS = r"\b(?:DIR|FILE|IMAGE|RUN|NAME)\b"
+PLACEHOLDERS = r"\b(?:DATABASE|QUERIES|MAP|IMAGES|DIR|FILE|IMAGE|RUN|NAME)\b"
 
 
 def blocks(page, language):
@@ -60,7 +60,9 @@ def test_settings_of_commands_are_valid(command, config):
     chosen = [each for each in arguments if each != "-m" and not each.startswith(("launcher=", "cluster"))]
     if "-m" in arguments:  # the first of several values
         chosen = [re.sub(r"=(\[[^]]*\]|[^,\[]*),.*", r"=\1", each) for each in chosen]
-    settings = programs.settings_of(*chosen, config=config)
+    if chosen[:2] == ["root", "root"] and config != "localize" and "ground_truth" not in command:
+        chosen.append("ground_truth=order")
+    settings = programs.settings_of(*with_paths_as_settings(config, chosen), config=config)
     for name in ("also", "report"):
         assert not getattr(settings, name, None) or compose_data_sets(getattr(settings, name))
 
@@ -73,7 +75,7 @@ def command_words(config):
 @pytest.mark.slow
 def test_the_first_command_of_the_readme_runs(small_street, tmp_path, monkeypatch, capsys):
     [command] = [line for page, line in COMMANDS if page == README and line.startswith("mfvpr evaluate")]
-    places = {f"dataset.{side}=DIR": f"dataset.{side}={small_street / side}" for side in ("database", "queries")}
+    places = {side.upper(): small_street / side for side in ("database", "queries")}
     arguments = [places.get(argument, argument) for argument in shlex.split(command)[2:]]
     monkeypatch.chdir(tmp_path)
     code, stdout, stderr = typed(monkeypatch, capsys, "evaluate", *arguments, *QUICK)

@@ -25,6 +25,8 @@ from omegaconf.errors import OmegaConfBaseException
 from mfvpr.checkpoints import entry_of, is_installed
 from mfvpr.cli import schema
 from mfvpr.cli.console import explain, one_line, tell, warn
+from mfvpr.datasets import image_folder
+from mfvpr.datasets.ground_truth import CHOICES, likely_ground_truth
 from mfvpr.evaluation import System
 from mfvpr.io.containers import reading
 from mfvpr.systems import assembly
@@ -32,8 +34,10 @@ from mfvpr.systems.assembly import CONF, without
 from mfvpr.utils.cluster import Cluster
 from mfvpr.utils.errors import InputError
 from mfvpr.utils.fields import from_values
+from mfvpr.utils.files import expand_user
 
 Job = Callable[[Any], None]  # of the settings of its program
+_FLAGS_WITH_VALUES = r"-c|--cfg|-p|--package|-i|--info|-c[pnd]|--config-(path|name|dir)|--experimental-rerun"
 # Without any of these arguments, `system=auto` chooses.
 _CHOICES = r"[~+]*(system|experiment|features|retrieval|matching|scorer)[=.@]|-h$|--help|--hydra-help|--info|--config"
 
@@ -43,7 +47,7 @@ def run(program: str, find_job: Callable[[], Job]) -> None:
     os.environ["HYDRA_FULL_ERROR"] = "1"  # Hydra then raises its errors
     warnings.filterwarnings("ignore", "A worker stopped")  # joblib renews a worker that has grown
     schema.register()
-    typed = sys.argv[1:]
+    typed = with_paths_as_settings(program, sys.argv[1:])
     if program in ("evaluate", "map") and not any(re.match(_CHOICES, each) for each in typed):
         at = next((place for place, each in enumerate(typed) if re.match("[^-].*=", each)), len(typed))
         typed.insert(at, "system=auto")  # beside the other settings, since Hydra takes one group of them
@@ -74,6 +78,49 @@ def run(program: str, find_job: Callable[[], Job]) -> None:
                 job(replace(settings, command=f"mfvpr {program} {shown}", multirun=multirun, workers=workers))
 
     hydra.main(version_base="1.3", config_path=str(CONF), config_name=program)(task)()
+
+
+def with_paths_as_settings(program: str, typed: list[str]) -> list[str]:
+    """`mfvpr evaluate DATABASE QUERIES`, `map build MAP IMAGES` and `localize MAP IMAGES` as settings.
+
+    With folders, the settings of the data set need no `dataset.`, and the ground truth is the likely one if none is
+    typed.
+    """
+    is_path = lambda each: re.match(r"[./]|~/", each) or not re.match(r"[-~]|.*=", each)  # noqa: E731
+    paths, others = list[str](), list[str]()
+    for before, each in itertools.pairwise(["", *typed]):
+        (paths if is_path(each) and not re.fullmatch(_FLAGS_WITH_VALUES, before) else others).append(each)
+    if not paths:
+        return typed
+    names = schema.FOLDER_SETTINGS
+    first, *rest = paths
+    usage = "DATABASE QUERIES" if program in ("evaluate", "sweep", "learn") else "MAP IMAGES"
+    if not rest or (program == "map" and len(rest) > 1):
+        raise InputError(f"{first}: expected {usage} and settings NAME=VALUE, got {' '.join(paths)}")
+    several = f"[{','.join(_quoted(path) for path in rest)}]" if len(rest) > 1 else _quoted(rest[0])
+    if program == "localize":
+        return [override("map", first), f"images={several}", *others]
+    if any(each.startswith("dataset=") for each in others):
+        raise InputError(f"{first}: expected either folders or dataset=NAME, got both; leave one out")
+    others = [f"dataset.{each}" if each.partition("=")[0] in names else each for each in others]
+    if program == "map":
+        first, several, others = rest[0], _quoted(rest[0]), [override("map", first), *others]
+    if not any(each.startswith("dataset.ground_truth=") for each in others):
+        kind = "none" if program == "map" else _likely_ground_truth(first, rest)
+        others.insert(0, f"dataset.ground_truth={kind}")
+    return ["dataset=folder", override("dataset.database", first), f"dataset.queries={several}", *others]
+
+
+def _likely_ground_truth(database: str, queries: list[str]) -> str:
+    """The ground truth that the names of images suggest, for all folders of queries; an InputError if there is none."""
+    names, *of_queries = (image_folder(expand_user(path)).names for path in (database, *queries))
+    found = {likely_ground_truth(each, names) for each in of_queries}
+    if len(found) > 1 or None in found:
+        got = f"{', '.join(map(str, map(len, of_queries)))} queries and {len(names)} database images of other names"
+        raise InputError(f"ground_truth: expected one of {CHOICES}, since there are {got}")
+    [(kind, reason)] = {each for each in found if each}
+    tell(f"ground_truth={kind}: {reason}; see mfvpr/datasets/README.md")
+    return kind
 
 
 def translate(override: str) -> list[str]:
@@ -173,8 +220,12 @@ def load_system(name: str | Path = "mfvpr", **settings: Any) -> System:
 
 def override(name: str, value: Any) -> str:
     """An override of text in Hydra's grammar."""
+    return f"{name}={_quoted(value)}"
+
+
+def _quoted(value: Any) -> str:
     escaped = str(value).replace("'", "\\'").replace("${", "\\${")
-    return f"{name}='{escaped}'"
+    return f"'{escaped}'"
 
 
 def _overrides(settings: Mapping[str, Any], prefix: str = "") -> Iterator[str]:

@@ -1,6 +1,8 @@
 """Notes, warnings, errors and progress of the programs, on stderr."""
 
+import difflib
 import os
+import re
 import signal
 import sys
 from collections.abc import Iterable, Iterator
@@ -60,6 +62,14 @@ def explain(error: Exception) -> str | None:
     text = " ".join((str(error) or str(error.__cause__)).split())
     for rest in (" Config search path", " See https", " To append to your ", " object_type="):
         text = text.partition(rest)[0]
+    if wrong := re.search(r"Could not find '(.*)/(.*)' Available options in '.*': (.*)", text):
+        group, name, choices = wrong[1], wrong[2], wrong[3].split()
+        nearest = "".join(f"; the nearest is {each}" for each in difflib.get_close_matches(name, choices, n=1))
+        return f"{group}={name}: expected one of {', '.join(choices)}{nearest}"
+    if wrong := re.search(r"Could not override '(.*?)'", text):
+        return f"{wrong[1]}: unknown setting"
+    if wrong := re.match(r"Missing mandatory value: .*full_key: (\S+)", text):
+        return f"{wrong[1]}: expected a value, got none"
     return text
 
 

@@ -30,7 +30,7 @@ Pixels = UInt8[np.ndarray, "height width channels"]
 
 
 def build_map(settings: MapBuild) -> None:
-    """Map the database of a data set: build map=DIR dataset=..., see `mfvpr map build --help`."""
+    """Map a folder of images, or the database of a data set: build MAP IMAGES, see `mfvpr map build --help`."""
     system = assembly.system(settings)
     images = dataset_of(settings.dataset).database
     folder = expand_user(settings.map)

@@ -276,6 +276,9 @@ class _Folder(_Images):
     query_labels: str | None = setting(None, PATH | None)
 
 
+FOLDER_SETTINGS = settings_of(_Folder).keys() - {"name", "root", "seasons", "database", "queries"}
+
+
 @dataclass(frozen=True)
 class _Drawn:
     """Streets that are drawn."""

@@ -217,6 +217,20 @@ def truth_from_names(query_names: Sequence[str], database_names: Sequence[str]) 
     return RadiusTruth(*sides)
 
 
+def likely_ground_truth(query_names: Sequence[str], database_names: Sequence[str]) -> tuple[str, str] | None:
+    """`utm` or `order`, and why names suggest it; None = they suggest nothing."""
+    try:
+        truth_from_names(query_names, database_names)
+        return "utm", "names have positions"
+    except InputError:
+        pass
+    if query_names == database_names:
+        return "order", "query i shows database image i, of the same name"
+    if len(query_names) == len(database_names):
+        return "order", f"query i shows database image i, if both folders are one path of {len(query_names)} images"
+    return None
+
+
 def truth_from_labels(
     query_file: Path | str, database_file: Path | str, query_names: Sequence[str], database_names: Sequence[str]
 ) -> LabelTruth:

@@ -51,7 +51,7 @@ def test_names_are_text_in_lists_of_folders_and_where_they_look_like_dates(call,
     (["check", "sequences", "database=d", "queries=[q]", "ground_truth=label"], "expected dataset.query_labels=FILE"),
     (["check", "gardens_point"], "dataset.root: expected a value"),
     (["check", "gardens_point", "root=/no/such"], "expected the folder of gardens_point, got nothing"),
-    (["check", "garden"], "Could not find 'dataset/garden'"),
+    (["check", "garden"], "dataset=garden: expected one of"),
     (["check"], "the following arguments are required: NAME"),
 ])  # fmt: skip
 def test_mistakes_are_one_line(call, arguments, words):

@@ -101,8 +101,8 @@ def test_a_run_records_the_size_that_the_images_decide(tmp_path):
 
 
 @pytest.mark.parametrize(("name", "settings", "words"), [
-    ("mix", {}, "Could not find 'system/mix'"),
-    ("steering", {"sigma": 3}, "Could not override 'sigma'"),
+    ("mix", {}, "system=mix: expected one of"),
+    ("steering", {"sigma": 3}, "sigma: unknown setting"),
     ("steering", {"features": "import"}, "^features.image_size=auto: expected a list of 2"),
     ("mfvpr", {"features": "import"}, "^features: files of other programs belong to a data set"),
     ("no/run.json", {}, "^no/run.json: expected the run.json of a run"),

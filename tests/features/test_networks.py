@@ -114,7 +114,7 @@ def test_lightglue_matches_the_street_and_its_store_is_its_own(evaluate, real_we
         (["retrieval=mixvpr", "retrieval.image_size=[224,224]"], "image_size=[224, 224]: expected [320, 320]"),
         (["matching=lightglue"], "mfvpr weights download aliked_lightglue"),
         (["retrieval=same"], "retrieval=same: expected features with a global descriptor"),
-        (["features=aliked", "features.contrast_threshold=2"], "Could not override 'features.contrast_threshold'"),
+        (["features=aliked", "features.contrast_threshold=2"], "features.contrast_threshold: unknown setting"),
         (["features.interpolation=torch_bilinear"], "SIFT takes whole numbers"),
     ],
 )
