@@ -6,7 +6,7 @@ CONSTRAINTS ?= /dev/null
 BIN := .venv/bin
 PIP := $(BIN)/python -m pip install --quiet --disable-pip-version-check --constraint $(CONSTRAINTS)
 
-PYTEST := $(BIN)/python -m pytest --numprocesses auto --maxprocesses 4 --dist loadfile --timeout 300
+PYTEST := $(BIN)/python -m pytest --numprocesses auto --maxprocesses 4 --dist loadfile --timeout 900
 # Half the compilation, for tests of logic. Tests of bits and of parity with other code are marked `optimized`.
 FLAGS := --xla_cpu_use_fusion_emitters=false --xla_cpu_parallel_codegen_split_count=1
 QUICK := JAX_DISABLE_MOST_OPTIMIZATIONS=1 XLA_FLAGS="`cat .venv/.flags`"
@@ -31,9 +31,10 @@ test-all: test
 test-wheel: .venv/.test
 	@folder=`mktemp -d`; trap "rm -rf $$folder" EXIT; \
 	$(BIN)/python -m hatchling build -t wheel -d $$folder && $(PYTHON) -m venv $$folder/env && \
-	$$folder/env/bin/python -m pip install --quiet --disable-pip-version-check $$folder/*.whl pytest && \
+	$$folder/env/bin/python -m pip install --quiet --disable-pip-version-check $$folder/*.whl pytest pytest-xdist && \
 	cp -r tests pyproject.toml $$folder && cd $$folder && \
-	JAX_DISABLE_MOST_OPTIMIZATIONS=1 env/bin/python -m pytest -m 'not (slow or thorough or optimized)'
+	JAX_DISABLE_MOST_OPTIMIZATIONS=1 env/bin/python -m pytest --numprocesses auto --maxprocesses 4 --dist loadfile \
+	-m 'not (slow or thorough or optimized)'
 
 setup: .venv/.setup
 

@@ -42,7 +42,8 @@ def build_map(settings: MapBuild) -> None:
 def print_map(folder: Path) -> None:
     """Print the number of images, the size on disk and the settings of a map."""
     settings, robot_map = read_settings(folder), Map.open(folder)
-    print(f"{folder}: {len(robot_map)} images, {sum(path.stat().st_size for path in folder.iterdir()) / 1e6:.1f} MB")
+    size = sum(path.stat().st_size for path in folder.iterdir()) / 1e6
+    print(f"{folder}: {len(robot_map)} images, {size:.1f} MB; {_calibration_in_words(robot_map)}")
     print(json.dumps(settings, indent=1, ensure_ascii=False))
 
 
@@ -52,18 +53,29 @@ def calibrate(folder: Path, database: Path, queries: Path, *, masks: Path | None
     `masks`: an image that is black where pixels of all images are ignored, or a folder with one for each image.
     `route`: for mfvpr localize route=..., where the retrieval standardizes descriptors.
     """
-    Map.open(folder).calibrate(database, queries, masks=masks, route=route)
-    print(printable(f"{folder}: calibrated on {queries}; use threshold= of mfvpr localize"))
+    robot_map = Map.open(folder)
+    robot_map.calibrate(database, queries, masks=masks, route=route)
+    print(f"{_calibration_in_words(robot_map)}; use threshold= of mfvpr localize")
 
 
-def add_images(folder: Path, images: list[Path], *, place: str | None = None) -> None:
+def _calibration_in_words(robot_map: Map) -> str:
+    about = robot_map.calibration()
+    if not about:
+        return "not calibrated: predictions have no confidence"
+    rule = about["confidence"]["standardize"]
+    scope = {None: "", "database": ", for images without a route", "running": ", for route="}.get(rule, "")
+    counts = f"{about['queries']} queries, {about['correct']} correct, {about['absent_queries']} as absent places"
+    return printable(f"calibrated on {about['of']}: {counts}{scope}{', with masks' * about['masks']}")
+
+
+def add_images(folder: Path, images: list[Path], *, place: str | None = None, mask: Path | None = None) -> None:
     """Add image files to a map, one by one; other processes may localize meanwhile.
 
-    `place` is where they were taken, by default their names.
+    `place` is where they were taken, by default their names; `mask` an image that is black where pixels are ignored.
     """
     robot_map = Map.open(folder)
     for path in images:
-        robot_map.add(path, path.name if place is None else place)
+        robot_map.add(path, path.name if place is None else place, mask=mask)
         print(printable(f"{path}: added, {len(robot_map)} images"), flush=True)
 
 
@@ -80,6 +92,8 @@ def localize(settings: Localize) -> None:
         confidence = fitting_confidences(settings.confidence, system, used)[0][system.headline]
     robot_map = Map(folder, system, confidence=confidence, threshold=settings.threshold, runtime=runtime)
     robot_map.require_confidence(settings.route is not None)
+    if settings.mask is not None:
+        read_image(expand_user(settings.mask))  # an error comes before any image
     drive = _Drive(robot_map, settings)
     for number, (name, image) in enumerate(images_of(settings)):
         if number == 0 and len(robot_map):

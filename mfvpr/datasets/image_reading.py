@@ -90,8 +90,10 @@ def fill_ignored(image: Pixels, mask: Path, *, orient: bool = True) -> tuple[Pix
     """
     brightness, (width, height) = Image.fromarray(read_image(mask, orient=orient)).convert("L"), image.shape[1::-1]
     if not 0.97 < brightness.width * height / (brightness.height * width) < 1.03:
-        got = f"{brightness.width} x {brightness.height}"
-        raise InputError(f"{mask}: expected a mask in the shape of its image, {width} x {height}, got {got}; turn it")
+        got = f"{brightness.width} x {brightness.height}; scale or turn it"
+        raise InputError(
+            f"{mask}: expected a mask in the shape of its image, {width} x {height}, got {got}; scale or turn it"
+        )
     ignored = np.asarray(brightness.resize(image.shape[1::-1], Image.Resampling.NEAREST)) < 128
     if ignored.all():
         expected = "a mask with pixels of 128 or more, which are used"

@@ -110,6 +110,7 @@ class Map:
         self._free_bytes = SHARE * free_host_bytes() if runtime.memory is None else 1e9 * runtime.memory
         self._noise_scores: dict[int, float] = {}  # by the number of rows
         self._typical = self.extractor.scales[0].typical_count
+        self._has_masks: bool | None = None  # whether images were built with masks; None = not known, or told
         self._matcher: Any = self.system.pipeline.matcher  # one that JAX compiles, see `describers_of`
         self._final = self.system.final_scores[self.system.headline]  # the score that decides
         self.refresh()
@@ -170,14 +171,16 @@ class Map:
         without the images of its place, as one of a place that the map does not show. `database` is a folder of images
         along a path, preferably another than that of the map, `queries` one of a drive along this path; for
         `ground_truth` and `masks`, see `mfvpr.datasets.folder`. The cache keeps features. If the retrieval standardizes
-        descriptors, it holds either with a `route` or for images without one.
+        descriptors, it holds either with a `route` or for images without one. It replaces an earlier one.
         """
         dataset = folder_dataset(database, queries, ground_truth=ground_truth, masks=masks)
         self.confidence, data = fit_on_drive(dataset, self.system, cache, self._rule_of(route))
         if (of_system := map_settings.system_fingerprint(self.system)) is None:
             warnings.warn("a part of the system names no `recipe`: the confidence is not kept on disk", stacklevel=2)
         else:
-            content = {"system": of_system, "queries": len(data.correct), "absent_queries": data.num_absent}
+            counts = {"queries": len(data.correct), "correct": int(data.correct.sum())}
+            counts |= {"absent_queries": data.num_absent}
+            content = {"system": of_system, "of": str(queries), "masks": masks is not None, **counts}
             with self._file.lock():
                 self._write({"confidence": json.dumps(content | {"confidence": vars(self.confidence)}).encode()})
         return self.confidence
@@ -218,9 +221,9 @@ class Map:
             recent: number of newest rows to leave out: while a drive is added, they show the same place.
             before: rows from this one on are left out as well, as if the map ended there; None = no such limit.
             route: of the drive that the image is the next one of; the prediction is then `located` on it.
-            among: rows that may be candidates; None = all.
+            among: rows that may be candidates; None = all. There is no confidence, which needs all rivals.
             near: (place, radius): only images within this distance of a place may be candidates, where places are lists
-                of numbers, such as positions in meters.
+                of numbers, such as positions in meters. There is no confidence.
             mask: image file that is black where pixels are ignored, such as on the robot's own hood.
 
         Raises:
@@ -231,6 +234,10 @@ class Map:
         if not isinstance(route, Route | None):
             raise InputError(f"route: expected Route(), the same for all images of a drive, got {route!r}")
         self.require_confidence(route is not None)
+        is_limited = among is not None or near is not None
+        if is_limited and self.threshold is not None:
+            expected = "candidates of the whole map, since a confidence says nothing about fewer"
+            raise InputError(f"threshold={self.threshold}: expected {expected}, got among= or near=; leave one out")
         _ROWS.check("recent", recent)
         _ROWS.check("before", 0 if before is None else before)
         with self._lock:
@@ -239,15 +246,20 @@ class Map:
             end = max(0, (total if before is None else min(int(before), total)) - int(recent))
             allowed = self.there[:end] if near is None else self._near(near)[:end]
             if among is not None:
+                if not isinstance(among, Iterable):
+                    raise InputError(f"among={among}: expected rows, such as [3, 4]")
                 rows = [*among]
                 for row in rows:
                     whole(0, total - 1).check("among", row)
                 allowed &= np.isin(np.arange(end), rows)
             described, resized = self.describing.pixels(pixels, mask)
+            self._warn_of_mask(mask)
             reason = reason_against_image(resized)
             if route is not None and self._rule_of(True) == "running" and reason is None:
                 route.see(described[1])
             localized = self._localize(described, allowed, pixels.shape[1::-1], reason, route)
+            if is_limited:
+                localized = localized._replace(prediction=replace(localized.prediction, confidence=None))
             if route is None:
                 return localized
             refusals = REFUSALS if self.confidence is None else self.confidence.refusals
@@ -256,6 +268,22 @@ class Map:
             if located is not None and located.row is None:
                 prediction = prediction.without_place("off the map")
             return localized._replace(prediction=prediction)
+
+    def _warn_of_mask(self, mask: Any) -> None:
+        """Warn, once, of an image that has a mask where those of the map have none, or the other way round."""
+        if self._has_masks is None and (part := self._file.part("masks")):
+            self._has_masks = json.loads(part)
+        if self._has_masks not in (None, mask is not None):
+            expected, got = ("a mask", "none") if self._has_masks else ("no mask", "one")
+            warnings.warn(f"{self.folder}: expected {expected}, as with the images of the map, got {got}", stacklevel=4)
+            self._has_masks = None
+
+    def calibration(self) -> dict[str, Any]:
+        """On what the confidence in the folder was fitted: numbers of `queries`, of `correct` ones, ...
+
+        Empty if the map is not calibrated.
+        """
+        return json.loads(self._file.part("confidence") or b"{}")
 
     def require_confidence(self, route: bool) -> None:
         """Raise an InputError if the confidence was fitted on candidates that images with, or without, a route lack."""
@@ -269,12 +297,20 @@ class Map:
         """Rows whose places are within a distance of a place."""
         try:
             place, radius = near
-            places = np.array([place, *(each for _, each in self._images)], np.float64)
-            if places.ndim != 2 or not np.isfinite(places).all() or not radius >= 0:
+            if np.array(place, np.float64).ndim != 1 or not radius >= 0:
                 raise ValueError
         except (TypeError, ValueError):
-            expected = "(place, radius), and places that are lists of as many numbers"
-            raise InputError(f"near={near}: expected {expected}, got a map with places like {self.place(0)}") from None
+            expected = "(place, radius), a list of numbers and a distance of at least 0"
+            raise InputError(f"near={near}: expected {expected}; such as ([12.5, 40.0], 25.0)") from None
+        try:
+            places = np.array([place, *(each for _, each in self._images)], np.float64)
+        except (TypeError, ValueError):
+            places = np.array([np.nan])
+        if not np.isfinite(places).all():
+            is_other = (np.shape(each) != np.shape(place) or isinstance(each, str) for _, each in self._images)
+            row = next((row for row, is_wrong in enumerate(is_other) if is_wrong), 0)
+            expected = f"a map with places of {len(place)} numbers"
+            raise InputError(f"near={near}: expected {expected}, got {self.place(row)!r} of {self.names[row]}")
         return np.linalg.norm(places[1:] - places[0], axis=1) <= radius
 
     def warm_up(self) -> None:
@@ -473,6 +509,8 @@ class Map:
             if {*images.names} <= {*self._row_of_name}:  # also in a map that can only be read
                 return 0
             with self._learned(images, cache) as cache:
+                if not len(self):
+                    self._write({"masks": json.dumps(images.masks is not None).encode()})
                 before, names = len(self), tuple(name for name in images.names if name not in self._row_of_name)
                 for batch in self.describing.folder(replace(images, names=names), cache):
                     entries = [Entry(names[row], place_of[names[row]], vector) for row, (_, vector) in batch.items()]
@@ -480,17 +518,19 @@ class Map:
                 self._noise_score(len(self), store=True)
                 return len(self) - before
 
-    def add(self, image: Image, place: Any, *, name: str | None = None) -> None:
+    def add(self, image: Image, place: Any, *, name: str | None = None, mask: Path | str | None = None) -> None:
         """Add an image and its place, any JSON value; an array needs a name, that of a file is its absolute path.
 
-        Errors are those of `build`; also for a name that the map has, and for a map without its vocabulary.
+        For `mask`, see `localize_with_evidence`. Errors are those of `build`; also for a name that the map has, and for
+        a map without its vocabulary.
         """
         with self._lock:
             if name is None:
                 if not isinstance(image, str | os.PathLike):
                     raise InputError("name: expected one for an image that is no file")
                 name = canonical_name(Path(image))
-            features, vector = self.describing.image(image)
+            self._warn_of_mask(mask)
+            features, vector = self.describing.pixels(query_steps.load(image), mask)[0]
             self.add_described([Entry(name, place, vector)], [features])
 
     def add_described(self, entries: Sequence[Entry], features: Sequence[Features]) -> None:

@@ -79,7 +79,7 @@ def test_masks_of_images(root):
     with one_line_error(r"0\.bmp: expected .* 128 or more, .* ignores the whole image"):
         folder.read(0)
     Image.fromarray(np.full((80, 60), 255, np.uint8)).save(root / "turned.png")
-    with one_line_error(r"turned\.png: expected a mask in the shape of its image, 160 x 120, got 60 x 80; turn it"):
+    with one_line_error(r"turned\.png: expected a mask in the shape of its image, 160 x 120, got 60 x 80; scale"):
         datasets.image_folder(root / "database", masks=root / "turned.png").read(0)
     data = datasets.folder(root / "database", root / "queries", ground_truth="order", masks=root / "mask.png")
     with one_line_error(r"mask\.png: expected an extractor .*, got FeatureFiles"):

@@ -324,7 +324,8 @@ def test_the_robots_hood_is_ignored_as_in_an_evaluation(small_street, tmp_path):
     known = Map.create(tmp_path / "map", database, map_system(SIFT, VladFitting(num_words=8), candidates=5))
     path = small_street / "queries" / "0003.png"
     localized = known.localize_with_evidence(path, mask=tmp_path / "hood.png")
-    masked, plain = localized.described[0], known.localize_with_evidence(path).described[0]
+    with pytest.warns(UserWarning, match="expected a mask, as with the images of the map, got none"):
+        masked, plain = localized.described[0], known.localize_with_evidence(path).described[0]
     height = SIFT.image_size[1]
     assert masked.keypoints[:, 1].max() < height / 2 < plain.keypoints[:, 1].max()
     queries = image_folder(small_street / "queries", masks=tmp_path / "hood.png")
@@ -343,7 +344,14 @@ def test_candidates_are_among_rows_or_near_a_place(dataset, tmp_path):
     assert sorted(rows_of(known.localize(image, near=([70, 8.0], 13)))) == [6, 7, 8]
     assert rows_of(known.localize(image, near=([70, 0], 13), among=[0, 6, 8], recent=len(known) - 7)) == [6]
     assert known.localize(image, among=[]).reason == "no candidates"
-    for mistake in ({"among": [len(known)]}, {"among": [0.5]}, {"among": [True]}, {"near": ([0], 5)},
+    known.confidence = SURE
+    assert known.localize(image).confidence is not None
+    assert known.localize(image, among=[7, 2]).confidence is None
+    known.threshold = 0.5
+    with one_line_error("threshold=0.5: expected candidates of the whole map"):
+        known.localize(image, near=([70, 8.0], 13))
+    known.threshold = None
+    for mistake in ({"among": 7}, {"among": [len(known)]}, {"among": [0.5]}, {"among": [True]}, {"near": ([0], 5)},
                     {"near": ("here", 5)}, {"near": ([0, 0], -1)}, {"near": 5}):  # fmt: skip
         with pytest.raises(InputError, match=r"^(among|near)=[^\n]*: expected [^\n]*$"):
             known.localize(image, **mistake)

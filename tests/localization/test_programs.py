@@ -299,7 +299,8 @@ def test_confidences_of_other_settings_are_named(folder, small_street, tmp_path,
 def test_a_map_is_calibrated(folder, small_street, call_program, localize):
     with pytest.warns(UserWarning, match="calibrate on a longer drive$"):  # ten frames
         stdout, _ = call_program("map", "calibrate", folder, small_street / "database", small_street / "queries")
-    assert stdout.startswith(f"{folder}: calibrated on {small_street}/queries")
+    assert stdout.startswith(f"calibrated on {small_street}/queries: 10 queries, ")
+    assert stdout.split(";")[0] in call_program("map", "info", folder)[0]
     [line], _ = localize(small_street / "database/0001.png", "threshold=0")
     assert 0 < line["confidence"] < 1
 
