@@ -50,7 +50,7 @@ _ROWS = whole(0, 10**9)  # an argument that is a number of rows
 
 
 class Map:
-    """Images with their places in a folder, in which one image at a time is localized.
+    """A folder of images with known places, in which one image at a time is localized.
 
         street = Map.create("map", "day/", mfvpr.load_system("steering"))
         street.calibrate("day/", "night/", ground_truth="order")

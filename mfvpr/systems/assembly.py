@@ -81,7 +81,7 @@ NETWORKS = {  # class of mfvpr.features, which Flax makes slow to import, and we
         "efficientnet": ("EfficientNetDescriptor", "efficientnet_lite0"),
     },
 }
-_WHITEN = "principal components that are kept, each of unit variance, fitted on the database; null = as they are"
+_WHITEN = "keep N whitened principal components, fitted on the database; null = off"
 _STANDARDIZE = "by the statistics of all queries, of those so far, or of the database alone, see features/README.md"
 _WEIGHTS = "weights above 0 by name, such as {retrieval: 0.5, anchor: 1}"
 _LIST = "`mfvpr weights list` has all weights"

@@ -98,7 +98,7 @@ NOT_NEGATIVE = number(0, 1e12)
 COUNT = whole(1, 10**6)
 INDEX = whole(0, 10**6)
 SIZE = list_of(whole(16, 4096), 2)
-SHAPED_SIZE = "width, height; auto: the shape of the first database image, at as many pixels; a number: at so many"
+SHAPED_SIZE = "width, height; auto: the first database image's shape at the default number of pixels; N: at N pixels"
 TEXT = text()
 PATH = text(r"(?s)(?!.*\$\{).+", "a path with variables filled in")
 
