@@ -79,7 +79,7 @@ def heading(report: EvaluationReport, description: RunDescription) -> str:
     return (
         f"{dataset.name}{incomplete}: {len(report.queries)} queries{several}, {len(dataset.database)} database images, "
         f"{candidates} candidates ({retrieval}), {matched_content(settings)}; "
-        f"{description.truth_words}{description.remark}"
+        f"{description.truth_words}; predictions by {report.headline}{description.remark}"
     )
 
 

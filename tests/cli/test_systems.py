@@ -76,7 +76,7 @@ def test_a_run_says_how_descriptors_were_standardized(tmp_path, tmp_path_factory
     evaluation.evaluate(job(f"out={tmp_path}/run"))
     [heading] = [line for line in capsys.readouterr().out.splitlines() if " queries, " in line]
     assert "(vlad and drive, standardized by drive)" in heading
-    assert "retrieval with the queries so far alone (running): R@1" in heading
+    assert "a robot, which knows earlier queries only, has R@1" in heading
     confidence = f"confidence={tmp_path}/run/confidence.json"
     evaluation.evaluate(job(f"out={tmp_path}/same", confidence))
     with pytest.raises(InputError, match=r"fitted with standardize=running, got drive; set retrieval.standardize"):
