@@ -107,7 +107,7 @@ def running_in_words(report: EvaluationReport, inputs: Inputs[Evaluate]) -> str:
         correct.append(hits(shortlist.indices, positives))
     recall = 100 * np.concatenate(correct).mean()
     within = threshold_words(inputs.ground_truth["unit"], report.threshold)
-    return f"; a robot, which knows earlier queries only, has R@1{within} {recall:.1f} by retrieval (standardize=running)"
+    return f"; a robot, which knows earlier queries only, has R@1{within} {recall:.1f} by retrieval (running)"
 
 
 def query_rows(queries: int | list[int | str], dataset: Dataset) -> int | list[int]:
