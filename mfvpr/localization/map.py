@@ -195,7 +195,7 @@ class Map:
         near: tuple[Sequence[float], float] | None = None,
         mask: Path | str | None = None,
     ) -> Prediction:
-        """Find where an image, a file or `[H, W, 3]` uint8 RGB, was taken; see `localize_with_evidence`."""
+        """Find where an image, a file or `[H, W, 3]` RGB, was taken; see `localize_with_evidence`."""
         return self.localize_with_evidence(
             image, recent=recent, route=route, among=among, near=near, mask=mask
         ).prediction
@@ -217,7 +217,8 @@ class Map:
         image (`mfvpr.evaluation.evidence`), without candidates, or with a confidence below the threshold.
 
         Args:
-            image: a file, or `[H, W, 3]` uint8 RGB in any form that `np.asarray` converts.
+            image: a file, or its bytes; or `[H, W, 3]` RGB or `[H, W]` gray in any form that `np.asarray` converts,
+                uint8, uint16, or floats from 0 to 1.
             recent: number of newest rows to leave out: while a drive is added, they show the same place.
             before: rows from this one on are left out as well, as if the map ended there; None = no such limit.
             route: of the drive that the image is the next one of; the prediction is then `located` on it.

@@ -1,6 +1,7 @@
 """Steps of localizing one image: describe it, search candidates, match and score them, and read the shift."""
 
 import os
+import tempfile
 from collections import defaultdict
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -33,24 +34,43 @@ from mfvpr.utils.runtime import ordered_map
 _PAIRS_AT_ONCE = 8  # a scorer takes the time of so many, also for a single image of a rare size
 _LEAST_SLOTS = 256  # of an image
 
-Image = Path | str | ArrayLike
+Image = Path | str | bytes | ArrayLike
 Described = tuple[Features, np.ndarray]
 Pixels = UInt8[np.ndarray, "_ _ 3"]
 Point = tuple[float, float]
 
 
 def load(image: Image) -> Pixels:
-    """Read an image file, or convert an array; an InputError if it is no image."""
+    """Read an image file, or its bytes, or convert an array; an InputError if it is no image.
+
+    Of 16 bits, the upper 8 are used; numbers of floating point are from 0 to 1, and opacity is left out.
+    """
     if isinstance(image, str | os.PathLike):
         return read_image(image)
+    if isinstance(image, bytes):
+        with tempfile.NamedTemporaryFile() as file:
+            file.write(image)
+            file.flush()
+            try:
+                return read_image(file.name)
+            except InputError as error:
+                reason = str(error).replace(file.name, "image")
+                raise InputError(f"image: expected the bytes of an image file, got {len(image)}: {reason}") from None
     pixels: Any = np.zeros(0)
     try:
         pixels = np.asarray(as_array(image))
         got = f"{list(pixels.shape)} {pixels.dtype}"
+        pixels = pixels[..., None] if pixels.ndim == 2 else pixels
+        pixels = np.repeat(pixels, 3, axis=2) if pixels.shape[2:] == (1,) else pixels[..., :3]
+        if pixels.dtype == np.uint16:
+            pixels = (pixels >> 8).astype(np.uint8)
+        elif pixels.dtype.kind == "f" and pixels.min(initial=0) >= 0 and pixels.max(initial=0) <= 1:
+            pixels = np.rint(255 * pixels).astype(np.uint8)
     except Exception as error:  # other libraries raise any error, torch for tensors with gradients
         got = f"{type(image).__name__} ({' '.join(str(error).split())})"
     if pixels.ndim != 3 or pixels.shape[2] != 3 or not pixels.size or pixels.dtype != np.uint8:
-        raise InputError(f"image: expected a file or [H, W, 3] uint8 RGB, got {got}. Convert it to a NumPy array.")
+        expected = "a file, its bytes, or [H, W] gray or [H, W, 3] RGB of uint8, uint16 or floats from 0 to 1"
+        raise InputError(f"image: expected {expected}, got {got}; convert it to a NumPy array")
     return pixels
 
 

@@ -4,13 +4,14 @@ import re
 from dataclasses import dataclass, replace
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 from PIL import Image
 
 import mfvpr
 from mfvpr.core.types import Features
-from mfvpr.datasets import image_folder
+from mfvpr.datasets import image_folder, read_image
 from mfvpr.evaluation import Confidence
 from mfvpr.evaluation.evidence import LEAST_MATCHES
 from mfvpr.evaluation.stages import explain
@@ -250,11 +251,25 @@ class Tensor:
 
 
 @pytest.mark.parametrize("image", [
-    np.zeros((4, 4), np.uint8), np.zeros((4, 4, 3)), np.zeros((0, 4, 3), np.uint8), None, Tensor(), b"0.png",
+    np.zeros((4, 4, 2), np.uint8), np.full((4, 4, 3), 2.0), np.zeros((0, 4, 3), np.uint8), np.zeros((4, 4), int), None,
+    Tensor(), np.full((4, 4), np.nan),
 ])  # fmt: skip
 def test_arrays_are_images(folder, image):
-    with pytest.raises(InputError, match=r"^image: .*\[H, W, 3\] uint8 .*got [^\n]+$"):
+    with pytest.raises(InputError, match=r"^image: .*\[H, W, 3\] RGB .*got [^\n]+$"):
         opened(folder).localize(image)
+
+
+def test_images_come_as_cameras_and_networks_give_them(dataset):
+    path = dataset.database.paths[0]
+    pixels = read_image(path)
+    gray = pixels[..., 0]
+    opaque = np.dstack([pixels, np.full(gray.shape, 255, np.uint8)])
+    for image in (path.read_bytes(), opaque, pixels.astype(np.uint16) << 8, pixels / 255, jnp.asarray(pixels / 255)):
+        np.testing.assert_array_equal(query_steps.load(image), pixels)
+    for image in (gray, gray[..., None], gray / np.float32(255)):
+        np.testing.assert_array_equal(query_steps.load(image), np.dstack([gray] * 3))
+    with one_line_error("image: expected the bytes of an image file, got 8: "):
+        query_steps.load(b"no image")
 
 
 def test_images_may_be_what_numpy_converts(dataset, folder):
