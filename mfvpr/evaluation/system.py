@@ -21,7 +21,7 @@ from mfvpr.features.sift import Sift
 from mfvpr.matchers.host_matcher import PairSource
 from mfvpr.matchers.matcher import NEIGHBORS, LightGlueMatcher, Matcher
 from mfvpr.retrieval.retriever import Retriever, with_parts
-from mfvpr.utils.errors import InputError, require_word
+from mfvpr.utils.errors import InputError, require_type, require_word
 from mfvpr.utils.fields import COUNT
 
 _TYPICAL_MATCHES = 1000  # of a pair that no features limit
@@ -137,6 +137,8 @@ class System:
     def __post_init__(self) -> None:
         """Raise an InputError for scorers out of their bounds, or names that are taken or unknown."""
         require_word("ties", self.ties, Ties)
+        require_type("pipeline", self.pipeline, Pipeline, "Pipeline(extractor, retriever)")
+        require_type("scorers", self.scorers, Mapping, '{"histogram": HistogramOfShifts()}')
         for name, filters in self.sequences.items():
             if not isinstance(filters, list | tuple) or not all(isinstance(each, DriveFilter) for each in filters):
                 raise InputError(f"sequences: expected a list of DriveFilter(...) for {name}, got {filters!r}")

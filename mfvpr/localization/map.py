@@ -422,6 +422,10 @@ class Map:
         [ranking] = rank_by_scores(shortlist, padded_scores, [self._final], self.system.ties).values()
         return Ranked(ranking.rows[:, : len(rows)], ranking.scores[:, : len(rows)])
 
+    def __repr__(self) -> str:
+        about = "" if self.confidence is None else ", calibrated"
+        return f"Map({str(self.folder)!r}, {len(self)} images{about})"
+
     def __len__(self) -> int:
         """Number of images."""
         return len(self._images)

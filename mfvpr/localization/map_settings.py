@@ -15,7 +15,7 @@ from mfvpr.retrieval.standardization import StandardizedSearch
 from mfvpr.storage.maps import MapFile
 from mfvpr.systems import assembly
 from mfvpr.systems.assembly import SystemSettings
-from mfvpr.utils.errors import InputError
+from mfvpr.utils.errors import InputError, require_type
 from mfvpr.utils.fields import from_values
 from mfvpr.utils.fingerprints import fingerprint, recipe_of
 
@@ -90,6 +90,7 @@ def fit_to_map(folder: Path, system: System, images: ImageFolder | None, note: N
 
     Raises `InputError` if a new map has no images to take the shape from, or one of images of another size.
     """
+    require_type("system", system, System, 'mfvpr.load_system("mfvpr")')
     if system.pipeline.pixels is None:
         return system
     if system.settings is not None and (content := MapFile(folder).part("system")):

@@ -18,7 +18,7 @@ from mfvpr.report.pages import write_report as write_page
 from mfvpr.report.run_files import CandidateLayout, save_run, write_candidates
 from mfvpr.report.runs import Table, claim_run_folder, data_frame, file_names, write_table
 from mfvpr.storage.feature_cache import FeatureCache
-from mfvpr.utils.errors import InputError
+from mfvpr.utils.errors import InputError, require_type
 from mfvpr.utils.runtime import Runtime
 
 if TYPE_CHECKING:
@@ -62,8 +62,12 @@ def evaluate(
     cache = FeatureCache() if cache is None else cache
     if not isinstance(cache, FeatureCache):
         raise InputError(f"cache: expected mfvpr.storage.FeatureCache(folder), got {type(cache).__name__}")
-    datasets = data if isinstance(data, Mapping) else {data.name: data}
-    systems = system if isinstance(system, Mapping) else {system.headline: system}
+    datasets = data if isinstance(data, Mapping) else {getattr(data, "name", ""): data}
+    systems = system if isinstance(system, Mapping) else {getattr(system, "headline", ""): system}
+    for dataset in datasets.values():
+        require_type("data", dataset, Dataset, 'mfvpr.datasets.folder("day", "night", ground_truth="order")')
+    for each in systems.values():
+        require_type("system", each, System, 'mfvpr.load_system("mfvpr")')
     if not datasets or not systems:
         raise InputError("evaluate: expected at least one data set and one system, got none")
     pairs = itertools.product(datasets, systems)

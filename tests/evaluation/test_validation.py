@@ -10,11 +10,12 @@ import mfvpr
 from mfvpr.core.types import Shortlist
 from mfvpr.datasets import FrameTruth
 from mfvpr.evaluation import DriveFilter, FrameCorrelation, Fusion
-from mfvpr.features import Description, Sift
+from mfvpr.features import Description, Sift, VladFitting
 from mfvpr.retrieval import Retrieval, RetrievalResult
 from mfvpr.storage import FeatureCache
 from mfvpr.utils import InputError
-from tests.builders import evaluate_parts
+from tests.builders import evaluate_parts, map_system
+from tests.io.checks import one_line_error
 from tests.shapes import unchecked_shapes
 
 pytestmark = pytest.mark.thorough
@@ -119,6 +120,19 @@ def evaluate(dataset, extractor=SIFT, chosen=Fixed((0, 1, 2)), scorers=HISTOGRAM
 def test_what_cannot_be_used_is_told(dataset, options, words):
     with unchecked_shapes(), pytest.raises(InputError, match=words):
         evaluate(dataset, **options)
+
+
+def test_other_types_are_told_with_an_example(dataset, tmp_path):
+    parts = map_system(SIFT, VladFitting(num_words=8))
+    for call, name in (
+        (lambda: mfvpr.evaluate(dataset, "mfvpr"), "system"),
+        (lambda: mfvpr.evaluate("day", parts), "data"),
+        (lambda: mfvpr.System(parts.pipeline, mfvpr.MatchCount()), "scorers"),
+        (lambda: mfvpr.System("sift", parts.scorers), "pipeline"),
+        (lambda: mfvpr.Map(tmp_path / "map", "mfvpr"), "system"),
+    ):
+        with one_line_error(f"^{name}: expected a .*, such as .*, got "):
+            call()
 
 
 def test_padding_of_ones_own_extractor_is_dropped(dataset, tmp_path):
