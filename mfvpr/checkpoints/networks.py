@@ -135,9 +135,9 @@ def plan_network(build: Callable[..., "nnx.Module"]) -> Blueprint:
     from flax import nnx
 
     key = jax.random.key(0)
-    keys: Any = SimpleNamespace(params=lambda: key)  # tracing the counters of nnx.Rngs takes twice as long as the rest
+    rngs: Any = SimpleNamespace(params=lambda: key)  # tracing the counters of nnx.Rngs takes twice as long as the rest
     with jax.numpy_dtype_promotion("standard"):  # Flax's initializers mix types
-        module = nnx.eval_shape(lambda: build(rngs=keys))
+        module = nnx.eval_shape(lambda: build(rngs=rngs))
     shapes = {_path(keys): leaf.shape for keys, leaf in nnx.to_flat_state(nnx.state(module))}
     parameters = sum(math.prod(leaf.shape) for leaf in jax.tree.leaves(nnx.state(module, nnx.Param)))
     return Blueprint(shapes, parameters, module)

@@ -87,38 +87,39 @@ def with_paths_as_settings(program: str, typed: list[str]) -> list[str]:
     typed.
     """
     is_path = lambda each: re.match(r"[./]|~/", each) or not re.match(r"[-~]|.*=", each)  # noqa: E731
-    paths, others = list[str](), list[str]()
+    paths, settings = list[str](), list[str]()
     for before, each in itertools.pairwise(["", *typed]):
-        (paths if is_path(each) and not re.fullmatch(_FLAGS_WITH_VALUES, before) else others).append(each)
+        (paths if is_path(each) and not re.fullmatch(_FLAGS_WITH_VALUES, before) else settings).append(each)
     if not paths:
         return typed
-    names = schema.FOLDER_SETTINGS
-    first, *rest = paths
     usage = "DATABASE QUERIES" if program in ("evaluate", "sweep", "learn") else "MAP IMAGES"
-    if not rest or (program == "map" and len(rest) > 1):
-        raise InputError(f"{first}: expected {usage} and settings NAME=VALUE, got {' '.join(paths)}")
-    several = f"[{','.join(_quoted(path) for path in rest)}]" if len(rest) > 1 else _quoted(rest[0])
+    if len(paths) < 2 or (program == "map" and len(paths) > 2):
+        raise InputError(f"{paths[0]}: expected {usage} and settings NAME=VALUE, got {' '.join(paths)}")
+    first, *rest = paths
+    listed = _quoted(rest[0]) if len(rest) == 1 else f"[{','.join(map(_quoted, rest))}]"
     if program == "localize":
-        return [override("map", first), f"images={several}", *others]
-    if any(each.startswith("dataset=") for each in others):
+        return [override("map", first), f"images={listed}", *settings]
+    if any(each.startswith("dataset=") for each in settings):
         raise InputError(f"{first}: expected either folders or dataset=NAME, got both; leave one out")
-    others = [f"dataset.{each}" if each.partition("=")[0] in names else each for each in others]
-    if program == "map":
-        first, several, others = rest[0], _quoted(rest[0]), [override("map", first), *others]
-    if not any(each.startswith("dataset.ground_truth=") for each in others):
-        kind = "none" if program == "map" else _likely_ground_truth(first, rest)
-        others.insert(0, f"dataset.ground_truth={kind}")
-    return ["dataset=folder", override("dataset.database", first), f"dataset.queries={several}", *others]
+    settings = [f"dataset.{each}" if each.partition("=")[0] in schema.FOLDER_SETTINGS else each for each in settings]
+    database = first
+    if program == "map":  # its data set has the same folder as queries, which are not read
+        [database] = rest
+        settings[:0] = [override("map", first), "dataset.ground_truth=none"]
+    elif not any(each.startswith("dataset.ground_truth=") for each in settings):
+        settings.insert(0, f"dataset.ground_truth={_likely_ground_truth(first, rest)}")
+    return ["dataset=folder", override("dataset.database", database), f"dataset.queries={listed}", *settings]
 
 
 def _likely_ground_truth(database: str, queries: list[str]) -> str:
     """The ground truth that the names of images suggest, for all folders of queries; an InputError if there is none."""
     names, *of_queries = (image_folder(expand_user(path)).names for path in (database, *queries))
-    found = {likely_ground_truth(each, names) for each in of_queries}
-    if len(found) > 1 or None in found:
+    likely = [likely_ground_truth(each, names) for each in of_queries]
+    kinds = {each and each[0] for each in likely}
+    if len(kinds) > 1 or likely[-1] is None:
         got = f"{', '.join(map(str, map(len, of_queries)))} queries and {len(names)} database images of other names"
         raise InputError(f"ground_truth: expected one of {CHOICES}, since there are {got}")
-    [(kind, reason)] = {each for each in found if each}
+    kind, reason = likely[-1]
     tell(f"ground_truth={kind}: {reason}; see mfvpr/datasets/README.md")
     return kind
 

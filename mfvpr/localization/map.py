@@ -110,7 +110,6 @@ class Map:
         self._free_bytes = SHARE * free_host_bytes() if runtime.memory is None else 1e9 * runtime.memory
         self._noise_scores: dict[int, float] = {}  # by the number of rows
         self._typical = self.extractor.scales[0].typical_count
-        self._has_masks: bool | None = None  # whether images were built with masks; None = not known, or told
         self._matcher: Any = self.system.pipeline.matcher  # one that JAX compiles, see `describers_of`
         self._final = self.system.final_scores[self.system.headline]  # the score that decides
         self.refresh()
@@ -173,6 +172,7 @@ class Map:
         `ground_truth` and `masks`, see `mfvpr.datasets.folder`. The cache keeps features. If the retrieval standardizes
         descriptors, it holds either with a `route` or for images without one. It replaces an earlier one.
         """
+        self._warn_of_mask(masks)
         dataset = folder_dataset(database, queries, ground_truth=ground_truth, masks=masks)
         self.confidence, data = fit_on_drive(dataset, self.system, cache, self._rule_of(route))
         if (of_system := map_settings.system_fingerprint(self.system)) is None:
@@ -253,8 +253,8 @@ class Map:
                 for row in rows:
                     whole(0, total - 1).check("among", row)
                 allowed &= np.isin(np.arange(end), rows)
-            described, resized = self.describing.pixels(pixels, mask)
             self._warn_of_mask(mask)
+            described, resized = self.describing.pixels(pixels, mask)
             reason = reason_against_image(resized)
             if route is not None and self._rule_of(True) == "running" and reason is None:
                 route.see(described[1])
@@ -271,19 +271,14 @@ class Map:
             return localized._replace(prediction=prediction)
 
     def _warn_of_mask(self, mask: Any) -> None:
-        """Warn, once, of an image that has a mask where those of the map have none, or the other way round."""
-        if self._has_masks is None and (part := self._file.part("masks")):
-            self._has_masks = json.loads(part)
-        if self._has_masks not in (None, mask is not None):
-            expected, got = ("a mask", "none") if self._has_masks else ("no mask", "one")
+        """Warn of an image that has a mask where those of the map have none, or the other way round."""
+        part = self._file.part("masks")  # None if the images were added one by one
+        if part is not None and json.loads(part) != (mask is not None):
+            expected, got = ("no mask", "one") if mask is not None else ("a mask", "none")
             warnings.warn(f"{self.folder}: expected {expected}, as with the images of the map, got {got}", stacklevel=4)
-            self._has_masks = None
 
     def calibration(self) -> dict[str, Any]:
-        """On what the confidence in the folder was fitted: numbers of `queries`, of `correct` ones, ...
-
-        Empty if the map is not calibrated.
-        """
+        """What the confidence was fitted on: `of` a folder, numbers of `queries` and `correct` ones; {} without one."""
         return json.loads(self._file.part("confidence") or b"{}")
 
     def require_confidence(self, route: bool) -> None:
@@ -298,21 +293,22 @@ class Map:
         """Rows whose places are within a distance of a place."""
         try:
             place, radius = near
-            if np.array(place, np.float64).ndim != 1 or not radius >= 0:
+            center = np.asarray(place, np.float64)
+            if center.ndim != 1 or not np.isfinite(center).all() or not radius >= 0:
                 raise ValueError
         except (TypeError, ValueError):
-            expected = "(place, radius), a list of numbers and a distance of at least 0"
-            raise InputError(f"near={near}: expected {expected}; such as ([12.5, 40.0], 25.0)") from None
+            expected = "(place, radius), such as ([12.5, 40.0], 25.0), with a radius of at least 0"
+            raise InputError(f"near={near}: expected {expected}") from None
+        places = [each for _, each in self._images]
         try:
-            places = np.array([place, *(each for _, each in self._images)], np.float64)
+            distances = np.linalg.norm(np.array(places, np.float64).reshape(-1, len(center)) - center, axis=1)
+            if len(distances) == len(places) and np.isfinite(distances).all():
+                return distances <= radius
         except (TypeError, ValueError):
-            places = np.array([np.nan])
-        if not np.isfinite(places).all():
-            is_other = (np.shape(each) != np.shape(place) or isinstance(each, str) for _, each in self._images)
-            row = next((row for row, is_wrong in enumerate(is_other) if is_wrong), 0)
-            expected = f"a map with places of {len(place)} numbers"
-            raise InputError(f"near={near}: expected {expected}, got {self.place(row)!r} of {self.names[row]}")
-        return np.linalg.norm(places[1:] - places[0], axis=1) <= radius
+            pass
+        row = next((row for row, each in enumerate(places) if np.shape(each) != center.shape), 0)
+        expected, got = f"a map with places of {len(center)} numbers", f"{places[row]!r} of {self.names[row]}"
+        raise InputError(f"near={near}: expected {expected}, got {got}")
 
     def warm_up(self) -> None:
         """Compile what `localize` needs for images like those of the map; an InputError for an empty map."""

@@ -61,7 +61,8 @@ def load(image: Image) -> Pixels:
         pixels = np.asarray(as_array(image))
         got = f"{list(pixels.shape)} {pixels.dtype}"
         pixels = pixels[..., None] if pixels.ndim == 2 else pixels
-        pixels = np.repeat(pixels, 3, axis=2) if pixels.shape[2:] == (1,) else pixels[..., :3]
+        pixels = np.repeat(pixels, 3, axis=2) if pixels.shape[2:] == (1,) else pixels
+        pixels = pixels[..., :3] if pixels.shape[2:] == (4,) else pixels
         if pixels.dtype == np.uint16:
             pixels = (pixels >> 8).astype(np.uint8)
         elif pixels.dtype.kind == "f" and pixels.min(initial=0) >= 0 and pixels.max(initial=0) <= 1:

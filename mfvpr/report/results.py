@@ -62,12 +62,12 @@ def evaluate(
     cache = FeatureCache() if cache is None else cache
     if not isinstance(cache, FeatureCache):
         raise InputError(f"cache: expected mfvpr.storage.FeatureCache(folder), got {type(cache).__name__}")
-    datasets = data if isinstance(data, Mapping) else {getattr(data, "name", ""): data}
-    systems = system if isinstance(system, Mapping) else {getattr(system, "headline", ""): system}
-    for dataset in datasets.values():
-        require_type("data", dataset, Dataset, 'mfvpr.datasets.folder("day", "night", ground_truth="order")')
-    for each in systems.values():
+    for each in data.values() if isinstance(data, Mapping) else [data]:
+        require_type("data", each, Dataset, 'mfvpr.datasets.folder("day", "night", ground_truth="order")')
+    for each in system.values() if isinstance(system, Mapping) else [system]:
         require_type("system", each, System, 'mfvpr.load_system("mfvpr")')
+    datasets = data if isinstance(data, Mapping) else {data.name: data}
+    systems = system if isinstance(system, Mapping) else {system.headline: system}
     if not datasets or not systems:
         raise InputError("evaluate: expected at least one data set and one system, got none")
     pairs = itertools.product(datasets, systems)

@@ -4,7 +4,10 @@ import re
 
 import pytest
 
+from mfvpr.cli.command_line import with_paths_as_settings
 from mfvpr.systems.assembly import choices_of
+from tests.builders import fill
+from tests.io.checks import one_line_error
 from tests.programs import ROOT, composed, run, small
 
 pytestmark = pytest.mark.thorough
@@ -86,6 +89,32 @@ def test_a_scorer_composes_with_the_values_of_its_fields():
 ])  # fmt: skip
 def test_mistakes_are_one_line_and_leave_nothing(refuse_at_once, program, arguments, words):
     assert words in refuse_at_once(program, *arguments)
+
+
+def test_folders_stand_for_settings(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    names = {"day": ["0", "1"], "night": ["0", "1"], "snow": ["a", "b"], "short": ["0"], "utm": ["@1@2@", "@3@4@"]}
+    fill(tmp_path, [f"{folder}/{name}.png" for folder, images in names.items() for name in images])
+
+    def settings(program, *typed):
+        return with_paths_as_settings(program, [*typed])
+
+    folders = ["dataset=folder", "dataset.database='day'"]
+    order = [*folders, "dataset.queries='night'", "dataset.ground_truth=order"]
+    assert settings("evaluate", "day", "-m", "night", "candidates=3") == [*order, "-m", "candidates=3"]
+    assert settings("sweep", "--cfg", "job", "day", "night") == [*order, "--cfg", "job"]
+    several = [*folders, "dataset.queries=['night','snow']", "dataset.ground_truth=order"]
+    assert settings("evaluate", "day", "night", "snow") == several
+    assert "of the same name" not in capsys.readouterr().err.splitlines()[-1]
+    assert settings("evaluate", "utm", "utm")[-1] == "dataset.ground_truth=utm"
+    assert settings("evaluate", "day", "short", "ground_truth=none")[-1] == "dataset.ground_truth=none"
+    for queries in (["short"], ["night", "short"]):
+        with one_line_error("ground_truth: expected one of order .*since there are"):
+            settings("evaluate", "day", *queries)
+    built = settings("map", "my map", "day", "masks=hood.png")
+    assert built[3:] == ["map='my map'", "dataset.ground_truth=none", "dataset.masks=hood.png"]
+    assert settings("localize", "map", "day", "./a=b") == ["map='map'", "images=['day','./a=b']"]
+    assert settings("evaluate", "dataset=streets") == ["dataset=streets"]
 
 
 @pytest.mark.parametrize(("program", "arguments", "words"), [

@@ -80,7 +80,7 @@ def test_the_fast_system_recognizes_the_street(evaluate, tmp_path, monkeypatch):
     evaluate("system=fast", "candidates=10", "figures=0")
     rows = [row for row in read_rows(tmp_path / "out") if row.get("tolerance") == 1]
     recall = {row["system"]: row["recall_at"]["1"] for row in rows}
-    assert recall["histogram"] >= 0.8 > recall["retrieval"]
+    assert recall["histogram"] >= max(0.8, recall["retrieval"])
 
 
 def test_lightglue_matches_the_street_and_its_store_is_its_own(evaluate, real_weights, tmp_path, monkeypatch):

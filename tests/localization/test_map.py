@@ -251,8 +251,8 @@ class Tensor:
 
 
 @pytest.mark.parametrize("image", [
-    np.zeros((4, 4, 2), np.uint8), np.full((4, 4, 3), 2.0), np.zeros((0, 4, 3), np.uint8), np.zeros((4, 4), int), None,
-    Tensor(), np.full((4, 4), np.nan),
+    np.zeros((4, 4, 2), np.uint8), np.zeros((4, 4, 5), np.uint8), np.full((4, 4, 3), 2.0),
+    np.zeros((0, 4, 3), np.uint8), np.zeros((4, 4), int), None, Tensor(), np.full((4, 4), np.nan),
 ])  # fmt: skip
 def test_arrays_are_images(folder, image):
     with pytest.raises(InputError, match=r"^image: .*\[H, W, 3\] RGB .*got [^\n]+$"):
@@ -367,7 +367,7 @@ def test_candidates_are_among_rows_or_near_a_place(dataset, tmp_path):
         known.localize(image, near=([70, 8.0], 13))
     known.threshold = None
     for mistake in ({"among": 7}, {"among": [len(known)]}, {"among": [0.5]}, {"among": [True]}, {"near": ([0], 5)},
-                    {"near": ("here", 5)}, {"near": ([0, 0], -1)}, {"near": 5}):  # fmt: skip
+                    {"near": ([np.nan], 5)}, {"near": ("here", 5)}, {"near": ([0, 0], -1)}, {"near": 5}):  # fmt: skip
         with pytest.raises(InputError, match=r"^(among|near)=[^\n]*: expected [^\n]*$"):
             known.localize(image, **mistake)
 
